@@ -37,7 +37,7 @@ from drivers.mujoco.world import PhysicsWorld
 Array = NDArray[np.float64]
 
 PERIOD = 0.01  # [s] of control
-PEG, MASS, GRASP = (0.48, -0.15), 0.12, 0.040  # [m] where it stands, [kg], [m] from its foot to the TCP
+PEG, MASS, GRASP = (0.48, -0.15), 0.12, 0.040  # [m] its place, [kg], [m] from its foot to the TCP
 HALF_LENGTH = 0.035  # [m] of the peg
 LONGEST = 120.0  # [s] of cell time for one motion
 

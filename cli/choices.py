@@ -72,7 +72,7 @@ def fields_of(model: Model) -> Iterator[ModelField]:
             yield from fields_of(inherited)
     for node in model.node.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            if _is_secret(node.value):
+            if _is_secret(node.value) or "ClassVar" in ast.unparse(node.annotation):
                 continue
             kind = _type_name(node.annotation)
             found = find_model(model.path, kind) if kind else None

@@ -240,7 +240,7 @@ def new(
     trust: Annotated[bool, typer.Option("--trust", help="let expressions of xacro files run any Python")] = False,
 ) -> None:
     """Write a robot file from a URDF: declared and measured values, and guesses, which are marked."""
-    from common.config import names_of
+    from common.config import default_cell
     from tools.robot_setup.descriptions import Reader, existing_folders, parse_arguments, written
     from tools.robot_setup.files import robot_file, write_cell
     from tools.robot_setup.maker_srdf import MakerSrdf, read_srdf
@@ -259,7 +259,7 @@ def new(
         raise ConfigError("--name", chosen, "must be letters, digits, - and _, and begin with a letter")
     path = Path(out or f"{chosen}.yaml").expanduser()
     pairs = path.with_suffix(".srdf")
-    template = like or names_of("cells")[0]
+    template = like or default_cell()
     _require_writable("--out", path, force)
     _require_writable("--out", pairs, force, (".srdf",))
     layout = _layout_of(cell, path, template, force) if cell else None

@@ -1,4 +1,4 @@
-"""Where a program is: its current step, whether that has begun, why it halts, and what is persisted of it."""
+"""Where a program is: its current step, whether that has started, why it halts, and what is persisted of it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Cursor:
         self.status = status
         self.flow: Flow | None = None
         self.position: Position = ()
-        self.begun = False  # whether the step there has begun
+        self.in_step = False  # whether the step there has started
         self.repeated = False  # whether it was interrupted before
         self.single = False  # whether to halt before each step
         self.passes = False  # whether the next step begins in any case: the operator let the program continue there
@@ -105,20 +105,20 @@ class Cursor:
 
     def go_to(self, position: Position) -> None:
         """Make a position the current one."""
-        self.position, self.begun, self.repeated = position, False, False
+        self.position, self.in_step, self.repeated = position, False, False
         self.show()
 
     def advance(self, decide: Decide) -> bool:
         """Follow loops and conditions to the next step that does something, and begin it unless the program halts.
 
         Returns:
-            Whether a step has begun.
+            Whether a step has started.
 
         Raises:
             Undecided: a condition is not known.
         """
-        if self.begun or not self.position:
-            return self.begun
+        if self.in_step or not self.position:
+            return self.in_step
         self.position = self.program.leaf(self.position, decide)
         self.show()
         if not self.position:
@@ -131,7 +131,7 @@ class Cursor:
 
     def begin(self, tool: m.Pose | None, *, holding: bool) -> None:
         """Note the beginning of the current step, with the pose of the tool in world; a repeated one began before."""
-        self.begun, self.passes = True, False
+        self.in_step, self.passes = True, False
         if self.repeated and self.progress.position == self.position and self.progress.start is not None:
             self.progress = self.progress.model_copy()  # is saved again
             return

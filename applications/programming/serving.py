@@ -162,14 +162,14 @@ class ProgramRunner(TaskRunner[View]):
     async def _run_program(self, request: ProgramCommand) -> None:
         task, status = self._program, self._program.status
         view = self._look()
-        goes_on = request.command == "resume" or (
+        continues = request.command == "resume" or (
             request.command == "step" and not request.step and request.program in ("", status.program)
             and bool(task.at.position))
-        command = "start" if not status.started or status.state in ("DONE", "ERROR") or not goes_on else "resume"
+        command = "start" if not status.started or status.state in ("DONE", "ERROR") or not continues else "resume"
         asked = m.TaskCommand(command=command, by=request.by, override=request.override,
                               acknowledged=request.acknowledged)
         require_allowed(asked, view.motion if view else None, self._owner.latest)
-        if not goes_on:
+        if not continues:
             if task.is_active:
                 raise Refused("busy", f"{status.program} is at step {status.step}: stop it first")
             if request.command == "run_from" and not request.step:

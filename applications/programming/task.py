@@ -152,9 +152,9 @@ class ProgramTask(Task[View]):
         self._fill(view)
 
     def may_start(self, stage: Stage, view: View) -> bool:
-        """Return whether a stage belongs to the step that has begun, and whose position is on disk."""
+        """Return whether a stage belongs to the step that has started, and whose position is on disk."""
         cycle, at = stage.cycle, self.at
-        of_step = not isinstance(cycle, StepCycle) or (at.begun and cycle.position == at.position and at.is_saved)
+        of_step = not isinstance(cycle, StepCycle) or (at.in_step and cycle.position == at.position and at.is_saved)
         return of_step and super().may_start(stage, view)
 
     def succeeded(self, stage: Stage, view: View) -> None:
@@ -173,7 +173,7 @@ class ProgramTask(Task[View]):
         super().clear()
         running = self.running.stage.cycle if self.running is not None else None
         self._queued = [each for each in self._queued[:1] if each[0] is running and each[0].left == 1]
-        self.at.repeated = self.at.repeated or (self.at.begun and not self._queued)
+        self.at.repeated = self.at.repeated or (self.at.in_step and not self._queued)
 
     def fail(self, message: str, view: View, *, go_home: bool = True) -> None:
         """Repeat the step after a failure, or end it: a program never goes home by itself."""
@@ -229,14 +229,14 @@ class ProgramTask(Task[View]):
     def _follow(self, view: View, passed: float) -> None:
         """Begin the next step, or continue one without stages; `passed` since the last step of the engine [s]."""
         try:
-            if not self.at.begun and self.at.advance(lambda condition: self._holds(condition, view)):
+            if not self.at.in_step and self.at.advance(lambda condition: self._holds(condition, view)):
                 self.at.begin(view.tcp, holding=view.holding)
                 self._spent = 0.0
                 self.status.state, self.status.message = "RUNNING", ""
         except Undecided as waits:
             self.status.message = f"{self.at.step.id} waits: {waits}"
             return
-        if not self.at.begun or not self.at.is_saved:
+        if not self.at.in_step or not self.at.is_saved:
             return
         step = self.at.step
         self._spent += passed if not self.running else 0.0
@@ -269,7 +269,7 @@ class ProgramTask(Task[View]):
             self.status.message = problem
             self._finish(FAILED)
             return
-        self.at.repeated, self.at.begun, self.status.outcome = True, False, FAILED
+        self.at.repeated, self.at.in_step, self.status.outcome = True, False, FAILED
         self.end("ERROR", f"{where}: {problem}")
 
     def _drop_all(self) -> None:
@@ -295,8 +295,8 @@ class ProgramTask(Task[View]):
     # --- stages ---------------------------------------------------------------------------------------------------
 
     def _fill(self, view: View) -> None:
-        """Queue the stages of the current step if it has begun, and of the next ones as far as they are known."""
-        if not self._queued and not (self.at.begun and self._append(self.at.position, self._now(view), view)):
+        """Queue the stages of the current step if it has started, and of the next ones as far as they are known."""
+        if not self._queued and not (self.at.in_step and self._append(self.at.position, self._now(view), view)):
             return
         while len(self._queued) <= AHEAD and self._queued[-1][1].known and self._not_ahead != self.at.position:
             last, built = self._queued[-1]

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from common import topics
 from common.clock import Clock
-from common.config import load_cell, names_of
+from common.config import default_cell, load_cell, names_of
 from common.errors import ConfigError, DecodeError, NoRouter, RequestFailed, UnknownName, ZencellError
 from common.messages import MotionStatus, SupervisorStatus
 from common.messages.basics import MAX_STAMP
@@ -41,7 +41,7 @@ class NoCellRunning(RequestFailed):
     """No router or cell is running at an endpoint."""
 
     def __init__(self, endpoint: str, what: str) -> None:
-        first = min(names_of("cells"), default="CELL")
+        first = default_cell() if names_of("cells") else "CELL"
         super().__init__(
             f"{what} at {endpoint}; is a cell up (`zencell up {first}`), and on this --domain or --connect?")
         self.endpoint = endpoint

@@ -27,6 +27,7 @@ from common.config.files import config_root, find_file, names_of, parse_yaml, re
 from common.config.io import Io, Signal
 from common.config.loading import (
     OVERRIDES_VARIABLE,
+    default_cell,
     expanded,
     load_cell,
     load_robot,

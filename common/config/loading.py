@@ -11,12 +11,13 @@ from typing import Any, TypeVar
 import yaml
 from pydantic_core import to_jsonable_python
 
-from common.application import application_of_task, find_application, import_from_folder_of
+from common.application import application_of_task, applications, find_application, import_from_folder_of
 from common.arms import arm_table
 from common.config.arms import read_robots, require_arm, services_of_arms
 from common.config.basics import Parameters, check, is_section, own_fields
 from common.config.cell import Cell
 from common.config.files import (
+    config_root,
     find_file,
     names_of,
     parse_yaml,
@@ -111,6 +112,19 @@ def _at(tree: dict[str, Any], path: Sequence[str]) -> Any:
     for part in path:
         node = node.get(part) if isinstance(node, dict) else None
     return node
+
+
+def default_cell() -> str:
+    """Return the name of the cell that commands suggest: the first of the default application, with one robot.
+
+    Raises:
+        UnknownName: the configuration has no cell.
+    """
+    names, tried = names_of("cells"), next((found.name for found in applications() if found.default), "")
+    if not names:
+        raise UnknownName("cell", "", names)
+    trees = ((name, read_yaml(config_root() / "cells" / f"{name}.yaml")) for name in names)
+    return next((name for name, tree in trees if tree.get("application") == tried and "robot" in tree), names[0])
 
 
 def load_cell(

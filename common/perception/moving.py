@@ -1,7 +1,7 @@
 """Position and velocity of an object from detections over time, on a belt with an encoder or without one.
 
-On a belt the encoder tells how far the object has moved between two images, also when the belt changes its speed: what
-is estimated from the images is only where it lies on the belt. Elsewhere a line is fitted through the newest positions.
+On a belt the encoder measures how far the object has moved between two images, also when the belt changes its speed:
+only where it lies on the belt is estimated from the images. Elsewhere a line is fitted through the newest positions.
 """
 
 from __future__ import annotations

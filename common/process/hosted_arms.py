@@ -97,7 +97,7 @@ def create_executors(
             raise ConfigError("speed", bus.clock.speed, "must be 1: the arm has a controller with a clock of its own")
         cell = None if within is None else SimulatedCell(
             within, hardware, model, simulator=config.world.simulator, persisted=persisted[arm], saver=savers[arm],
-            beside=first_cell)
+            first=first_cell)
         first_cell = first_cell or cell
         tool = described_tool(model)
         force = ForceSensing(hardware, model, model.config.tcp_link, model.config.gripper, model.config.wrench,

@@ -52,7 +52,7 @@ class Body:
     like: str = ""  # id of the object of the initial layout whose shape it shares
     mass: float = 0.0  # [kg]; 0: unknown
     holder: str = ""  # arm that holds it, in a world with several
-    second: str = ""  # arm whose gripper presses on it too, and takes it over when the holder lets go
+    second: str = ""  # arm whose gripper presses on it too, and takes it over when the holder releases it
     _message: WorldObject | None = None  # cached until the body changes
     _snapshot: ObjectSnapshot | None = None  # cached until the body changes
 

@@ -36,7 +36,7 @@ class Hand:
         self.T: Array | None = None
 
     def take(self, body: Body) -> None:
-        """Hold a body that the gripper presses on and another one has let go of."""
+        """Hold a body that the gripper presses on and another one has released."""
         assert self.T is not None
         low, high = self.between.pop(body.name)
         body.grip, body.holder, body.second = invert(self.T) @ body.T, self.arm, ""

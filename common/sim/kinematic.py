@@ -188,7 +188,7 @@ class KinematicWorld(WorldEvents):
         body = self.held_by(hand.arm)
         T_world_hand = hand.T = T_world_tcp @ hand.T_tcp_closing
         pressed = set(hand.between) if gripping else set()
-        for other in self._bodies.values():  # it let go of what another one holds
+        for other in self._bodies.values():  # it released what another one holds
             if other.second == hand.arm and other.holder != hand.arm and other.name not in pressed:
                 other.second = ""
         if body is None and pressed:
@@ -201,7 +201,7 @@ class KinematicWorld(WorldEvents):
         if body is not None:
             self.version += body.carry(T_world_hand)
             if width > body.width + self._tolerances.release:
-                self._let_go(body, now)
+                self._hand_over(body, now)
         for each in self._bodies.values():
             if each.state == "falling":
                 self._fall(each, now)
@@ -225,7 +225,7 @@ class KinematicWorld(WorldEvents):
                 self._release(body, now)
         self.belts.update_barriers(self._bodies.values())
 
-    def _let_go(self, body: Body, now: float) -> None:
+    def _hand_over(self, body: Body, now: float) -> None:
         """Hand a body over to the other gripper that presses on it; drop it if there is none."""
         taker = self._hands.get(body.second) if body.second != body.holder else None
         if taker is None or taker.T is None or body.name not in taker.between:

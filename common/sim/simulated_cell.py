@@ -90,7 +90,7 @@ class SimulatedCell:
     def __init__(
         self, world: SimulatedWorld, hardware: Hardware, kinematics: Kinematics | None, *,
         simulator: str = "kinematic", persisted: SimulationState | None = None, saver: Saver | None = None,
-        beside: SimulatedCell | None = None,
+        first: SimulatedCell | None = None,
     ) -> None:
         """Surround this hardware.
 
@@ -101,7 +101,7 @@ class SimulatedCell:
             simulator: name of the simulator.
             persisted: the state before a restart, which `restore` applies.
             saver: of the state.
-            beside: that of the first arm, if this is a further one in the same world: it reports the objects.
+            first: that of the first arm, if this is a further one in the same world: it reports the objects.
 
         Raises:
             ConfigError: the gripper cannot be blocked by objects.
@@ -118,7 +118,7 @@ class SimulatedCell:
         self._published_version, self._published_at = -1, -math.inf  # cell time [s]
         self._saved: tuple[object, ...] = ()
         self._saved_objects: tuple[int, dict[str, ObjectSnapshot]] | None = None  # with the version of the world
-        self._first = beside
+        self._first = first
         self._suspended = False
         self.defers_steps = False
         self.deferred: Callable[[], None] | None = None

@@ -1,7 +1,7 @@
 """Conveyor belts in physics: bodies that move at the speed of the belt, and are put back before each step.
 
 Contact friction acts by the velocity of the surface, which is that of a slide joint. Its position is reset before each
-step, so that the solid stays where it is, and its velocity is set anew, so that nothing slows it.
+step, so that the solid stays where it is, and its velocity is set again, so that nothing slows it.
 """
 
 from __future__ import annotations

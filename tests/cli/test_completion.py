@@ -7,7 +7,7 @@ import pytest
 from cli import choices
 from cli import choices as completion
 from common.application import all_topics
-from common.config import load_cell, service_config, service_names
+from common.config import load_cell, names_of, service_config, service_names
 from common.config.tunables import leaves
 from common.planning.planners import planner_names
 from common.topics import Topic
@@ -87,9 +87,9 @@ def test_completed_names_are_those_of_the_code():
         assert len(about) <= choices.LONGEST_DOC and "[" not in about
     assert words(choices.services("")) == set(service_names()) - {"router"}
     assert words(choices.planners("")) == set(planner_names())
-    panda, sorting, wanted = load_cell("panda"), load_cell("sorting"), set[str]()
+    cells, wanted = [load_cell(name) for name in ("panda", *names_of("cells"))], set[str]()
     for name in set(service_names()) - {"router"}:
-        cell = sorting if name in sorting.services else panda
+        cell = next((cell for cell in cells if name in cell.services), cells[0])
         config = service_config(cell, name, importlib.import_module(f"services.{name}").Config)
         wanted |= {path for path in leaves(config, name) if path.startswith("services.")}
     assert words(choices.parameters("services.")) == wanted

@@ -83,7 +83,7 @@ async def tool(bus: Bus) -> float:
     return float((await Cell.on(bus).arm.pose())[2, 3])
 
 
-def test_killed_runner_stands_at_its_step_until_the_operator_resumes_it(tmp_path: Path) -> None:
+def test_killed_runner_halts_at_its_step_until_the_operator_resumes_it(tmp_path: Path) -> None:
     (tmp_path / "lift.yaml").write_text(LIFT)
     made: list[Simulation] = []
     heights: list[float] = []

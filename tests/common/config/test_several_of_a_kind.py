@@ -64,7 +64,7 @@ def test_single_camera_is_set_under_both_names_and_one_of_several_by_a_file(tmp_
     (["world.cameras={a: {}, b: {}}", "world.camera.fx=400"], r"camera is for a world with one: this one has a, b"),
     (["world.cameras={a: {frame: x}, b: {frame: x}}"], r"cameras\.b has the frame of a: x"),
     (["world.cameras={a: {fz: 3}}"], r"world\.cameras\.a\.fz: 3 is not a parameter; choices: cx, cy"),
-    (["robot.gripper.cup.radius=1"], r"robot\.gripper\.cup\.radius: 1 is not a parameter; choices: give, lip_radius$"),
+    (["robot.gripper.cup.radius=1"], r"cup\.radius: 1 is not a parameter; choices: give, lip_radius, vacuum$"),
     (["robot.attachments=[{urdf: a, parent_link: b, xyz: 0}]"], r"\.0\.xyz: .* choices: parent_link, position, rpy"),
     (["world.fixtures=[{id: a, shape: sphere, dimensions: [1, 1], position: [0, 0, 0]}]"], r"1 of dimensions, not 2"),
     (["world.objects=[{id: a, shape: sphere, radius: 0.02, height: 1}]"], r"height has no effect .*; choices: radius$"),

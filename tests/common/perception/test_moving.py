@@ -51,7 +51,7 @@ def test_encoder_carries_an_object_on_through_a_change_of_speed_without_images()
     assert velocity == pytest.approx([0.2, 0.0, 0.0])
 
 
-def test_object_that_was_moved_by_hand_starts_anew() -> None:
+def test_object_that_was_moved_by_hand_starts_again() -> None:
     estimate = MovingEstimate(encoders([0.1] * 100))
     for time in (10.0, 10.1, 10.2, 10.3):
         estimate.add(time, (0.1 * (time - 10), 0.0, 0.07), 0.04)

@@ -43,7 +43,7 @@ def test_belt_carries_an_object_along_its_direction_at_its_speed(yaw: float, exp
     assert one.belts.state(Header()).belts[0].position == pytest.approx(0.2)
 
 
-def test_object_beside_a_belt_stays_and_one_on_top_of_another_comes_along() -> None:
+def test_object_next_to_a_belt_stays_and_one_on_top_of_another_comes_along() -> None:
     one = world({"x": 0.3, "y": 0.0, "z": 0.1}, {"x": 0.3, "y": 0.0, "z": 0.14}, {"x": 0.3, "y": 0.3})
     run(one, 0.0, 1.0)
     assert [place(one, f"object_{n}")[0] for n in range(3)] == pytest.approx([0.5, 0.5, 0.3])

@@ -49,7 +49,7 @@ def test_both_grippers_hold_an_object_at_a_time() -> None:
     assert rig.world.bodies["ball_2"].T[2, 3] == pytest.approx(R)
 
 
-def test_object_stays_with_its_holder_until_that_lets_go_and_then_follows_the_other() -> None:
+def test_object_stays_with_its_holder_until_that_releases_it_and_then_follows_the_other() -> None:
     rig = Hands()
     rig.step("left", at(0.5, 0.0), CLOSED)
     high = at(0.5, 0.0, 0.4)
@@ -66,7 +66,7 @@ def test_object_stays_with_its_holder_until_that_lets_go_and_then_follows_the_ot
     assert rig.world.bodies["ball_1"].state == "falling"
 
 
-def test_object_falls_when_the_other_gripper_let_go_first() -> None:
+def test_object_falls_when_the_other_gripper_released_it_first() -> None:
     rig = Hands()
     rig.step("left", at(0.5, 0.0), CLOSED)
     high = at(0.5, 0.0, 0.4)
