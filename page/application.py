@@ -17,9 +17,10 @@ class ApplicationTab:
 
     Attributes:
         label: of the tab.
-        panel: class of its content, created with `(gui, console, readout)` once the robot is loaded; `readout` is a
-            `page.manual_control.ArmReadout`. Its method `show(arm_blocked, now)` updates it while a browser is
-            connected: why no operator can move the arm now, or an empty text; wall time [s], monotonic.
+        panel: class of its content, created with `(gui, console, readout, play)` once the robot is loaded: `readout`
+            is a `page.manual_control.ArmReadout`, and `play(trajectory)` animates the ghost of the robot. Its method
+            `show(arm_blocked, now)` updates it while a browser is connected: why no operator can move the arm now, or
+            an empty text; wall time [s], monotonic.
     """
 
     label: str

@@ -190,7 +190,7 @@ class Page:
                     self._belts = BeltPanel(gui, self.console, self._belt_names)
         if self._tab is not None and self._own_tab is not None:
             with self._own_tab:
-                self._own = self._tab.panel(gui, self.console, self._move.readout)
+                self._own = self._tab.panel(gui, self.console, self._move.readout, scene.play)
         for name, on in self._shown.items():
             scene.set_shown(name, on)
         if self._editing:

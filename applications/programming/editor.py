@@ -252,8 +252,8 @@ class ProgramEditor:
 
     # --- run ---
 
-    async def command(self, command: str, step: str = "", *, enabled: bool = True) -> None:
-        """Send a command for the open program; what was not saved is saved first.
+    async def command(self, command: str, step: str = "", *, enabled: bool = True, paced: bool = False) -> None:
+        """Send a command for the open program, with fields of `ProgramCommand`; what was not saved is saved first.
 
         Raises:
             RemoteError: it is refused; if another operator holds the arm, the same command again overrides that.
@@ -268,7 +268,7 @@ class ProgramEditor:
         request = (command, name, step, console.acknowledged, status.step if status else "")
         override, self._rejected = self._rejected == request and command in MOVES, None
         message = check(ProgramCommand, {
-            "command": command, "program": name, "step": step, "enabled": enabled, "override": override,
+            "command": command, "program": name, "step": step, "enabled": enabled, "paced": paced, "override": override,
             "by": console.permissions.client_name, "acknowledged": console.acknowledged}, "program")
         console.notify("")
         try:

@@ -17,6 +17,7 @@ from applications.programming.step_fields import StepFields
 from applications.programming.step_list import list_of_steps, state_of
 from applications.programming.topics import PROGRAM_COMMAND, PROGRAM_EDIT, PROGRAM_STATUS, ProgramStatus
 from common import topics
+from common.messages import JointTrajectory
 from page.application import ApplicationPage, ApplicationTab
 from page.console import Console, assign
 from page.markup import Html, block, buttons, line, press
@@ -34,15 +35,19 @@ LOST = "the service of programs does not respond"
 class ProgramPanel:
     """The tab: programs, buttons to run one, its steps, the fields of the chosen step."""
 
-    def __init__(self, gui: viser.GuiApi, console: Console, readout: ArmReadout) -> None:
+    def __init__(
+        self, gui: viser.GuiApi, console: Console, readout: ArmReadout, play: Callable[[JointTrajectory], None]
+    ) -> None:
         """Build the tab.
 
         Args:
             gui: of the server.
             console: runs the buttons and sends requests.
             readout: of the arm, for its present pose.
+            play: animates the ghost of the robot.
         """
-        self._console, self._readout = console, readout
+        self._console, self._readout, self._play = console, readout, play
+        self._played: int | None = None  # stamp of the newest plan when a dry run was first seen, or that was animated
         self.editor = ProgramEditor(console, self._known)
         self._name, self._kind, self._listed = "", "move", -LIST_PERIOD
         self._checked: object = None  # draft and data of the newest check
@@ -75,6 +80,7 @@ class ProgramPanel:
         for row in draft.rows if draft is not None else ():
             self._on_press(f"choose:{row.id}", partial(editor.choose, row.id))
         self._show_orders(status)
+        self._show_ghost(status)
         self._form.show(editor.chosen, fields_of(step, self._known(), editor.point) if step is not None else [])
         state = (draft, draft.data if draft is not None else None)
         if available and state != self._checked:
@@ -117,6 +123,7 @@ class ProgramPanel:
         start = editor.incomplete or ("" if halted else blocked["Start"])
         chosen = start or ("" if editor.chosen else "choose a step first")
         at, send = editor.chosen, editor.command
+        rehearsing = status is not None and status.rehearsal.state == "running"
         rows = buttons(
             self._button("Run", "run", partial(send, "run"), start, arm=True, main=not halted),
             self._button("Run from here", f"run_from:{at}", partial(send, "run_from", at), chosen, arm=True),
@@ -127,9 +134,20 @@ class ProgramPanel:
             self._button("Continue", "resume", partial(send, "resume"), "" if halted else blocked["Resume"], arm=True,
                          main=halted),
             self._button("Stop program", "stop", partial(send, "stop"), "" if task is not None else LOST),
-            self._button("Dry run", "dry_run", partial(send, "dry_run"), editor.incomplete or (
+            self._button("Skip motions" if rehearsing else "Dry run", f"dry_run:{not rehearsing}",
+                         partial(send, "dry_run", paced=not rehearsing), editor.incomplete or (
                 "" if task is not None else LOST)))
         self._run.set(block(rows + state_of(status), "run", state=status.state if status else ""))
+
+    def _show_ghost(self, status: ProgramStatus | None) -> None:
+        """Animate each motion that a dry run plans, while it waits for as long as the motion takes."""
+        plan = self._console.latest(topics.DISPLAY_TRAJECTORY)
+        stamp = plan.header.stamp if plan is not None else 0
+        if status is None or status.rehearsal.state != "running" or self._played is None:
+            self._played = stamp
+        elif plan is not None and stamp != self._played:
+            self._played = stamp
+            self._play(plan)
 
     def _show_orders(self, status: ProgramStatus | None) -> None:
         editor, draft, step, id_ = self.editor, self.editor.draft, self.editor.step, self.editor.chosen

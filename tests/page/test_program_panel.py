@@ -15,7 +15,7 @@ from applications.programming.page import ProgramPanel
 from applications.programming.step_fields import TYPING_DEBOUNCE
 from applications.programming.topics import ProgramStatus, Rehearsal, RehearsedStep
 from common import topics
-from common.messages import Header, JointState
+from common.messages import Header, JointState, JointTrajectory
 from page.manual_control import ArmReadout
 from tests.applications.programming.program_service import Cell
 from tests.page.scene_cell import robot_of
@@ -31,11 +31,14 @@ class Page:
     def __init__(self, gui: viser.GuiApi) -> None:
         self.cell = Cell()
         self.cell.files["two"] = TWO
+        self.plan: JointTrajectory | None = None  # newest one that was published
+        self.played: list[JointTrajectory] = []
         console = self.cell.console
         latest, joints = console.latest, JointState(
             header=Header(), name=list(ROBOT.joint_names), position=Q.tolist(), velocity=[0.0] * 6, effort=[0.0] * 6)
-        console.latest = lambda topic: joints if topic is topics.JOINT_STATES else latest(topic)
-        self.panel: Any = ProgramPanel(gui, console, ArmReadout(ROBOT, console.latest))
+        console.latest = lambda topic: joints if topic is topics.JOINT_STATES else (
+            self.plan if topic is topics.DISPLAY_TRAJECTORY else latest(topic))
+        self.panel: Any = ProgramPanel(gui, console, ArmReadout(ROBOT, console.latest), self.played.append)
         self.now = 0.0
 
     def show(self) -> str:
@@ -136,6 +139,26 @@ async def test_dry_run_shows_seconds_of_each_step_and_its_problem(page: Page) ->
     page.cell.status = ProgramStatus(program="two", rehearsal=Rehearsal(
         program="two", state="failed", steps=[failed], message="move1"))
     assert page.steps[1] == "2 move to home no path: table would collide"
+
+
+def plan_at(stamp: int) -> JointTrajectory:
+    return JointTrajectory(header=Header(stamp=stamp), joint_names=["a"], points=[])
+
+
+async def test_motions_of_a_dry_run_are_animated_one_after_the_other_and_can_be_skipped(page: Page) -> None:
+    await page.panel.editor.open("two")
+    page.plan = plan_at(1)  # of a former motion
+    await page.press("Dry run")
+    page.cell.status = ProgramStatus(program="two", rehearsal=Rehearsal(program="two", state="running"))
+    for stamp in (1, 2, 2, 3):
+        page.plan = plan_at(stamp)
+        page.show()
+    await page.press("Skip motions")
+    page.cell.status = ProgramStatus(program="two", rehearsal=Rehearsal(program="two", state="done"))
+    page.plan = plan_at(4)
+    page.show()
+    assert [plan.header.stamp for plan in page.played] == [2, 3]
+    assert [(each.command, each.paced) for each in page.cell.commands] == [("dry_run", True), ("dry_run", False)]
 
 
 async def test_typed_value_is_applied_before_a_button_acts_or_after_a_pause(page: Page) -> None:
