@@ -35,6 +35,7 @@ class Config(Parameters):
                                                           "back after this time [s]")
     overtaken: float = Field(5.0, ge=0, le=60, description="a request that waited longer is not overtaken any more [s]")
     longest_wait: float = Field(120.0, ge=1, le=3600, description="a request that waited longer is refused [s]")
+    turns: bool = Field(False, description="one arm moves at a time, as for comparison or a first start")
     message: float = Field(0.03, ge=0.001, le=0.5, description="longest time of a message to or from an executor [s]")
 
 
@@ -48,7 +49,7 @@ def coordinator_of(config: Config, service: str) -> tuple[Coordinator, Scenes]:
         raise ConfigError(f"services.{service}", ..., "is for a cell with several robots: leave it out")
     robots = {name: RobotModel.load(robot) for name, robot in config.arms.robots.items()}
     options = Options(config.clearance, config.patience, config.overtaken, config.longest_wait,
-                      delays=Delays(message=config.message))
+                      delays=Delays(message=config.message), turns=config.turns)
     scenes = Scenes(robots, config.motion.object_padding)
     try:
         geometries = [ArmGeometry(name, robot) for name, robot in robots.items()]

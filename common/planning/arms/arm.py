@@ -27,6 +27,7 @@ class Options:
         overtaken: how long younger requests may overtake an older one [s].
         longest_wait: after which a request is refused [s].
         effort: cells that may be measured in a step, about 0.1 ms each; longer proofs take several steps.
+        turns: one arm moves at a time.
     """
 
     clearance: float = 0.02
@@ -34,6 +35,7 @@ class Options:
     overtaken: float = 5.0
     longest_wait: float = 120.0
     effort: int = 300
+    turns: bool = False
     delays: Delays = field(default_factory=Delays)
 
 

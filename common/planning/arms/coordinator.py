@@ -218,6 +218,9 @@ class Coordinator:
         if arm.state is None or arm.state.held_by_others:
             ticket.reason = "the arm is held" if arm.state else "no state of the arm was received yet"
             return
+        if self.options.turns and (moving := [each.name for each in self._others(arm) if each.committed is not None]):
+            ticket.waits_for, ticket.reason = set(moving), f"one arm moves at a time, {moving[0]} now"
+            return
         older = [each for each in waiting if each.ticket is not None and each.ticket.number < ticket.number]
         if ticket.moving is None:
             ticket.waits_for |= {each.name for each in self._others(arm) if each.committed is not None or each in older}
