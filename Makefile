@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.up-to-date
 
-.PHONY: setup franka-sim run up test test-all campaign grasping conveyor force-motions force-payload containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
+.PHONY: setup franka-sim run up test test-all campaign grasping two-arms conveyor force-motions force-payload containers check audit bench bench-check chaos fuzz soak docs docs-site deploy clean
 
 setup: $(STAMP)
 
@@ -49,6 +49,11 @@ test-all: setup  ## `make test`, and what takes long
 campaign: setup  ## tests that repeat over hundreds of seeds, or for minutes
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "campaign and not alone"
 	$(BIN)/python -m pytest -q -m "campaign and alone"
+
+two-arms: setup  ## two arms cross over one table: contacts by an independent judge, makespan, time of proofs; half an hour
+	$(BIN)/python -m benchmarks.two_arms tasks --count 200 --jobs 2
+	$(BIN)/python -m benchmarks.two_arms cell --count 3
+	$(BIN)/python -m benchmarks.two_arms proofs --count 100
 
 # Resumable: seeds that are in build/grasping.jsonl are not run again. Needs the extra: make setup EXTRAS=physics.
 grasping: setup  ## grasps of unseen objects by the complete sorting cell, hours; seeds as published in docs/grasping.md

@@ -251,25 +251,30 @@ class TwoArms:
 
     def judged(self, step: float = 0.02) -> list[float]:
         """Return the distances between the arms [m] along all recorded states, about a step [rad] of a joint apart."""
-        judge, found = Judge(self.robots["left"], self.robots["right"]), []
-        last = np.concatenate(self.states[0][1:])
-        for number, (_, left, right) in enumerate(self.states):
-            both = np.concatenate([left, right])
-            move = float(np.abs(both - last).max())
-            if move < step / 2 and 0 < number < len(self.states) - 1:
-                continue
-            count = max(1, int(np.ceil(move / step)))
-            for k in range(1, count + 1):
-                q = last + (both - last) * k / count
-                found.append(judge.distance(q[:7], q[7:]))
-            last = both
-        return found
+        return judged(self.robots["left"], self.robots["right"], [(a, b) for _, a, b in self.states], step)
 
     def moved_at(self, arm: str, after: float) -> float:
         """Return when an arm moved first after a time [s]."""
         index = list(self.arms).index(arm) + 1
         times = [state for state in self.states if state[0] > after]
         return next(b[0] for a, b in pairwise(times) if not np.array_equal(a[index], b[index]))
+
+
+def judged(one: RobotModel, other: RobotModel, states: list[tuple[Array, Array]], step: float) -> list[float]:
+    """Return the distances [m] of two arms along states (dof,) of both, about a step [rad] of a joint apart."""
+    judge, found = Judge(one, other), []
+    last = np.concatenate(states[0])
+    for number, pair in enumerate(states):
+        both = np.concatenate(pair)
+        move = float(np.abs(both - last).max())
+        if move < step / 2 and 0 < number < len(states) - 1:
+            continue
+        count = max(1, int(np.ceil(move / step)))
+        for k in range(1, count + 1):
+            q = last + (both - last) * k / count
+            found.append(judge.distance(q[:7], q[7:]))
+        last = both
+    return found
 
 
 def reachable(robot: RobotModel, count: int, seed: int) -> list[Array]:
