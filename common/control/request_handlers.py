@@ -180,7 +180,10 @@ class RequestHandlers:
         """Move by the wrench at the tool."""
         if not request.trajectory.points:
             return self._executor.move_by_force(request, self._clock.now())
-        status = self._executor.move_by_force(request, self._clock.now(), self._check_age(request.header))
+        refusal = self._check_age(request.header)
+        if self.permission is not None:
+            refusal = Refused("several_arms", "a motion by force is not proved against other arms")
+        status = self._executor.move_by_force(request, self._clock.now(), refusal)
         if status.state == "rejected":
             self._log.warning("force motion %s rejected: %s [%s]", request.id, status.message, status.error)
         return await self._persisted(status)

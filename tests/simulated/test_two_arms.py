@@ -8,6 +8,7 @@ from common import messages as m
 from common import topics
 from common.arms import arms_topic
 from common.config import load_cell
+from common.errors import RemoteError
 from lab.simulation import Simulation
 
 CELL = str(Path(__file__).parents[1] / "data" / "two_arms.yaml")
@@ -67,6 +68,30 @@ def test_nothing_moves_without_the_coordinator(tmp_path: Path) -> None:
     Simulation(load_cell(str(cell)), 1, visit=visit, limit=15.0).run()
     assert errors == {"no_coordinator"}
     assert len(positions) == 1
+
+
+@pytest.mark.slow
+def test_motions_that_are_not_proved_against_the_other_arm_are_refused() -> None:
+    codes: dict[str, str] = {}
+
+    async def visit(bus) -> None:
+        states = await bus.reader(arms_topic(topics.JOINT_STATES, "left")).next()
+        here = m.JointTrajectory(joint_names=states.name[:7], points=[
+            m.JointTrajectoryPoint(positions=states.position[:7], velocities=[0.0] * 7, accelerations=[0.0] * 7,
+                                   time_from_start=at) for at in (0.0, 1.0)])
+        by_force = bus.client(arms_topic(topics.MOTION_FORCE, "left"))
+        answer = await by_force.call(m.ForceMotion(id="f", kind="until", trajectory=here, header=bus.header("world")))
+        codes["force"] = answer.error
+        execute = bus.client(arms_topic(topics.MOTION_EXECUTE, "left"))
+        codes["joining"] = (await execute.call(m.ExecuteRequest(
+            id="j", trajectory=here, joins="another", header=bus.header("world")))).error
+        order = bus.client(arms_topic(topics.ROBOT_COMMAND, "left"))
+        with pytest.raises(RemoteError) as refused:
+            await order.call(m.RobotCommand(act="freedrive", value=1.0))
+        codes["freedrive"] = refused.value.code
+
+    Simulation(load_cell(CELL), 1, visit=visit, limit=8.0).run()
+    assert codes == dict.fromkeys(("force", "joining", "freedrive"), "several_arms")
 
 
 @pytest.mark.slow
