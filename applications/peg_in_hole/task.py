@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common import messages as m
-from common.config import Parameters
+from common.config import Parameters, RobotConfig, Scenery
 from common.config.basics import Length, Point
+from common.errors import ConfigError
+from common.hardware.interface import is_simulated
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix, rpy_to_matrix
+from common.sim.interface import KINEMATIC
 from common.tasks.force import Insert
 from common.tasks.handling import Handling, HandlingConfig
 from common.tasks.stages import AwaitImage, Cycle, Grip, Move, Place, Stage, View, place_of
@@ -39,6 +42,18 @@ class Config(HandlingConfig):
     """Parameters of the task."""
 
     hole: Hole
+    robot: RobotConfig
+    scenery: Scenery = Scenery()
+
+    def require_usable(self) -> None:
+        """Require an arm that measures forces, as far as the configuration says.
+
+        Raises:
+            ConfigError: a simulated arm is in a world without forces.
+        """
+        super().require_usable()
+        if self.scenery.simulator == KINEMATIC and is_simulated(self.robot):
+            raise ConfigError("world.simulator", KINEMATIC, "has no forces, which an insertion needs: use mujoco")
 
 
 class Inserting(Handling):

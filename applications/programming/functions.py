@@ -28,7 +28,7 @@ def find_function(reference: str, folder: Path) -> Callable[..., Any]:
         known = error.name is not None and f"{module}.".startswith(f"{error.name}.")
         raise ConfigError("function", reference, where_searched(module) if known and "." in module else (
             f"cannot be imported: {error}")) from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ConfigError("function", reference, f"cannot be imported: {type(error).__name__}: {error}") from None
     if not callable(found):
         choices = [key for key, value in vars(importlib.import_module(module)).items() if inspect.isfunction(value)]
@@ -53,7 +53,7 @@ async def call_function(step: Python, folder: Path) -> tuple[str, str]:
         return "", f"{step.function} took longer than {step.timeout:g} s"
     except ConfigError as error:
         return "", str(error)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         return "", f"{step.function} raised {type(error).__name__}: {error}"
     if isinstance(result, bool):
         return "succeeded" if result else "failed", ""

@@ -21,7 +21,8 @@ from common.config import Number
 from common.tasks.palletizing import Pattern
 
 Distance = Annotated[float, Field(gt=0, le=2, allow_inf_nan=False)]  # [m]
-Metres3 = tuple[Number, Number, Number]
+Bounded = Annotated[Number, Field(ge=-1000, le=1000)]
+Metres3 = tuple[Bounded, Bounded, Bounded]
 Share = Annotated[float, Field(gt=0, le=1)]
 Timeout = Annotated[float, Field(gt=0, le=86_400)]
 Id = Annotated[str, Field(max_length=60, pattern=r"^[\w.-]*$")]
@@ -40,7 +41,7 @@ class Target(Part):
     """Where the tool moves: a name, joint positions, a pose in world, or a motion relative to the present pose."""
 
     name: str = Field("", description="pose of the program, of the robot file, or saved on the page")
-    joints: list[Number] | None = Field(None, min_length=1, max_length=64, description="[rad, m]")
+    joints: list[Bounded] | None = Field(None, min_length=1, max_length=64, description="[rad, m]")
     position: Metres3 | None = Field(None, description="of the tool centre point in world [m]")
     rpy: Metres3 = Field(DOWN, description="roll, pitch, yaw about fixed axes, with position [rad]; default: down")
     by: Metres3 | None = Field(None, description="displacement from the present pose [m]")

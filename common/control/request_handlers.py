@@ -318,7 +318,7 @@ class RequestHandlers:
         state = self._executor.set_conveyor(request, self._header("world"), refusal)
         wanted = [] if request.running is None else ["on" if request.running else "off"]
         wanted += [] if request.speed is None else [f"{request.speed:g} m/s"]
-        self._log.info("conveyor %s: %s by %s", request.name or state.belts[0].name, ", ".join(wanted),
+        self._log.info("conveyor %s: %s by %s", request.name or state.belts[0].name, ", ".join(wanted) or "unchanged",
                        request.owner or "the task")
         return state
 

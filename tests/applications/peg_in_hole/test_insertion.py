@@ -1,4 +1,4 @@
-"""The insertion cell on a virtual clock with physics, and without it."""
+"""The insertion cell on a virtual clock with physics, and its installed world."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import math
 
 import pytest
 
+from applications.peg_in_hole.task import Config
 from applications.peg_in_hole.topics import INSERTION_STATUS
 from common import topics
-from common.config import load_cell
+from common.config import load_cell, service_config
+from common.errors import ConfigError
 from common.transport.bus import Bus
 from lab.simulation import Simulation
 
@@ -57,3 +59,9 @@ def test_hole_of_the_installed_world_is_a_tenth_of_a_millimetre_wider_than_its_p
         assert wall.dimensions[1] / 2 > gaps[-1] * math.tan(math.pi / 12), "no gap between walls"
     assert sorted(turns) == list(range(0, 360, 30))
     assert [2 * (gap - peg.radius) for gap in gaps] == pytest.approx([1e-4] * 12, abs=2e-6)
+
+
+def test_world_without_forces_is_refused_before_anything_moves() -> None:
+    cell = load_cell("insertion", ["world.simulator=kinematic"])
+    with pytest.raises(ConfigError, match=r"world\.simulator: 'kinematic' has no forces.*: use mujoco"):
+        service_config(cell, "inserter", Config).require_usable()

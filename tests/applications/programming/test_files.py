@@ -34,6 +34,8 @@ def test_program_is_written_as_it_was_read_and_every_step_has_an_id() -> None:
 
 @pytest.mark.parametrize(("text", "problem"), [
     ("steps: [}", ":1: does not parse: expected the node content, but found '}'"),
+    ("steps:\n  - {step: move, to: {joints: [1.0e+308]}}",
+     ":2: steps[0].to.joints[0]: 1e+308 must be less than or equal to 1000"),
     ("steps: []", ":1: steps: [] List should have at least 1 item after validation, not 0"),
     ("cell: panda", ": steps: is missing"),
     ("steps:\n  - {step: move}", ":2: steps[0].to: is missing"),

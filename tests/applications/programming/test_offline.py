@@ -95,6 +95,14 @@ def test_run_refuses_a_cell_for_what_is_no_program(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (2, "zencell: --cell: 'ur5' is for a program, and 'panda' is a cell\n")
 
 
+def test_function_whose_module_ends_the_process_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "ending.py").write_text("import sys\nsys.exit(0)\n")
+    file = written(tmp_path, "steps: [{step: python, function: 'ending:f'}]")
+    done = ask(tmp_path, "program", "check", file, "--cell", CELL)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "'ending:f' cannot be imported: SystemExit: 0" in done.stderr and done.stderr.count("\n") == 1
+
+
 def test_exported_script_is_readable_python_for_every_kind_of_step(tmp_path: Path) -> None:
     (tmp_path / "functions_of_an_export.py").write_text("def measure(size):\n    return size\n")
     file = written(tmp_path, """\
