@@ -9,6 +9,8 @@ from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from applications.pick_place.ball_places import BallGeometry
@@ -25,6 +27,8 @@ from common.robot.home import HomeMonitor
 from common.robot.model import RobotModel
 from common.scene.workspace import ReachCache
 from common.transport.bus import Bus
+
+Array = NDArray[np.float64]
 
 OLDEST = 0.5  # [s, cell time] a camera this far behind the newest one does not show the current state
 
@@ -275,6 +279,8 @@ class Validation:
             same_place: detections closer than this are at the same position [m]; less than the distance of balls.
         """
         self._resting = BallGeometry.of(around)
+        self._others = [replace(self._resting, container=around.containers[name]) for name in around.destinations
+                        if around.containers[name] != around.container]  # filled by other arms
         self._reach = reach
         self.forget_after = forget_after
         self._same_place = same_place
@@ -308,6 +314,8 @@ class Validation:
                 result.unknown.append(place)
             elif reason == INSIDE_CONTAINER:
                 result.inside += 1
+            elif any(other.shows_container(camera, self._pixel(marker, camera)) for other in self._others):
+                continue
             elif reason:
                 result.refused.append((place, reason))
                 # A falling object is an outlier for a moment; a carried one may cross the border of the image.
@@ -325,12 +333,14 @@ class Validation:
     def _reason(self, marker: Marker, camera: Pinhole) -> tuple[Place, str | None]:
         """Return a position and why it is no target: empty when it is one, None while unknown."""
         place = (marker.pose.position.x, marker.pose.position.y, marker.pose.position.z)
-        pixel = marker.pixel if marker.pixel is not None else camera.project(place)
-        if self._resting.shows_container(camera, pixel):
+        if self._resting.shows_container(camera, self._pixel(marker, camera)):
             return place, INSIDE_CONTAINER
         if marker.text:  # the detector's reason against taking it
             return place, marker.text
         return place, PARTLY_OUT_OF_VIEW if marker.partial else self._reach.known(place)
+
+    def _pixel(self, marker: Marker, camera: Pinhole) -> Sequence[float] | Array:
+        return marker.pixel if marker.pixel is not None else camera.project(_place(marker))
 
     def _stays(self, place: Place, stamp: int) -> bool:
         """Return whether an outlier has been there long enough."""

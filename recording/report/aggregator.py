@@ -6,12 +6,13 @@ The aggregator is fed from a running cell (by `Collector`) and from a recording 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from common import topics as t
 from common.application import Application, applications
+from common.arms import arms_topic
 from common.client.statistics import Rates
 from common.config import RobotConfig
 from common.messages import Message, TaskStatus
@@ -35,7 +36,7 @@ class RunAggregator:
     def __init__(
         self, cell: str, application: Application | None, *, robot: RobotConfig | None = None, seed: int = 0,
         speed: float = 1.0, containers: Sequence[str] = (), history: RunHistory | None = None,
-        listeners: Mapping[Topic[Any], Listener] | None = None,
+        listeners: Mapping[Topic[Any], Listener] | None = None, arms: Iterable[str] = (),
     ) -> None:
         """Start without messages.
 
@@ -48,6 +49,7 @@ class RunAggregator:
             containers: ids of those that objects are put into; empty: unknown, all.
             history: to be filled as well, for a report.
             listeners: further listeners by topic, as for a verification.
+            arms: names of the arms in a cell of several.
         """
         self.figures: Figures = figures_of(application)(robot, for_report=history is not None)
         self.summary = Summary(cell, seed, speed, self.figures, containers,
@@ -66,7 +68,8 @@ class RunAggregator:
                 self._add(rejected, summary.on_rejections)
                 if history is not None:
                     self._add(rejected, history.on_rejections)
-        self._add(t.MOTION_STATUS, summary.on_motion)
+        for topic in [arms_topic(t.MOTION_STATUS, arm) for arm in arms] or [t.MOTION_STATUS]:
+            self._add(topic, summary.on_motion)
         self._add(t.SCENE_OBJECTS, lambda _, message: summary.truth.on_objects(message))
         if self.figures.TRUTH is not None:
             self._add(self.figures.TRUTH, lambda _, message: summary.truth.on_labels(message))

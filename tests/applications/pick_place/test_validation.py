@@ -39,6 +39,12 @@ def test_detections_are_classified():
     assert verdict.inside == 1
 
 
+def test_contents_of_a_container_that_another_arm_fills_are_no_targets_and_no_rejections():
+    two = Surroundings(containers={"near": {"x": 0.55, "y": 0.25}, "far": {"x": 0.5, "y": -0.25}})
+    verdict = Validation(two, Reach()).validate(frame((0.4, 0.05), (0.5, -0.25), (0.55, 0.25)), camera)
+    assert (verdict.targets, verdict.refused, verdict.inside) == ([(0.4, 0.05, 0.03)], [], 1)
+
+
 def test_container_precedes_partial_view_precedes_reach():
     judge, reported = validation(), []
     for stamp in (0.0, 0.3, 0.6):  # one that is carried across the border is not reported
