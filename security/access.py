@@ -141,7 +141,9 @@ def rights_of_tools(services: Iterable[Rights] = ()) -> dict[str, Rights]:
 def _states(services: Iterable[Rights]) -> set[str]:
     # Not `**`: to the router a `get` of every key is also a call of every request.
     known = {topic.expression for topic in all_topics().values() if topic.kind == "state"}
-    return known.union(key for rights in services for key in rights.keep if general_key(key) == key)
+    own = {key for rights in services for key in rights.keep if general_key(key) == key}
+    of_arms = {f"*/{key}" for key in known}  # of arms with any name: the rules for one cell do not depend on another's
+    return known | of_arms | {key for key in own if key.partition("/")[2] not in known}
 
 
 def access_control(cells: Mapping[str, Mapping[str, Rights]]) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import asyncio
 import concurrent.futures
 import inspect
 import math
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,6 +22,7 @@ from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix, rpy_
 from common.tasks.handling import DROP, grasp_directions
 from common.tasks.palletizing import Pattern, slot_at
 from common.tasks.stages import place_of
+from common.time_source import monotonic
 
 Array = NDArray[np.float64]
 NEAR = 0.2  # [m] from the tool: objects that the gripper may touch when it moves back
@@ -83,12 +83,12 @@ def pick(
     Raises:
         MotionFailed: none is seen, or it was not grasped.
     """
-    ends, found = time.monotonic() + timeout, list[m.CollisionObject]()
+    ends, found = monotonic() + timeout, list[m.CollisionObject]()
     while not found:
         found = [each for each in cell.objects() if each.role == role and kind in ("", each.kind)
                  and object in ("", each.id)
                  and not any(slot_at(pattern, place_of(each.pose)) for pattern in outside)]
-        if not found and time.monotonic() > ends:
+        if not found and monotonic() > ends:
             raise MotionFailed("not_seen", f"no {object or kind or 'object'} with role {role} is seen")
     at = cell.arm.pose()[:2, 3]
     thing = min(found, key=lambda each: math.dist(place_of(each.pose)[:2], at))
