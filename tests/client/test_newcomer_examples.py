@@ -49,6 +49,7 @@ def test_program_tends_the_machine_and_fills_the_pallet() -> None:
     assert (outcome.state, outcome.crashes, states[-1]) == ("DONE", [], "DONE"), outcome
 
 
+@pytest.mark.campaign
 @pytest.mark.alone
 def test_odd_parts_are_lifted_in_physics() -> None:
     lines = run(EXAMPLES / "odd_parts" / "grip.py").splitlines()

@@ -16,8 +16,7 @@ def arm(monkeypatch):
 # The last sequence has standstill, a low and the full speed.
 DWELLS = [(sequence, 0.1) for sequence in SLIDERS] + [
     pytest.param(sequence, dwell, marks=mark) for sequence in SLIDERS for dwell, mark in (
-        (1.0, () if sequence is SLIDERS[-1] else pytest.mark.slow),
-        (30.0, pytest.mark.slow if sequence is SLIDERS[-1] else pytest.mark.campaign))]
+        (1.0, () if sequence is SLIDERS[-1] else pytest.mark.slow), (30.0, pytest.mark.campaign))]
 
 
 @pytest.mark.parametrize("jogs", [False, True], ids=["motion", "jog"])
