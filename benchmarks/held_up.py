@@ -19,7 +19,8 @@ import numpy as np
 from common.config import load_cell
 from common.control.executor import Executor
 from common.errors import Refused
-from common.hardware.interface import Hardware, Limits, load_hardware
+from common.hardware.backends import load_hardware
+from common.hardware.interface import Hardware, Limits
 from common.messages import ExecuteRequest, Header, HoldRequest, JogCommand, MotionStatus, StopRequest
 from common.robot.model import RobotModel
 from tests.common.control.trajectories import rest_to_rest
@@ -115,7 +116,8 @@ def outcome(rig: Rig, good: bool, why: Counter[str]) -> int:
 
 def report(what: str, good: int, count: int, why: Counter[str], rig: Rig) -> None:
     """Print a line, and the most frequent reasons of failures."""
-    print(f"{what}: {good} of {count} go on (interrupted and resumed so far: {rig.executor.arm.resumed})", flush=True)
+    resumed = rig.executor.arm.gaps.resumed
+    print(f"{what}: {good} of {count} go on (interrupted and resumed so far: {resumed})", flush=True)
     for reason, number in why.most_common(4):
         print(f"    {number}: {reason}", flush=True)
 
@@ -234,7 +236,7 @@ def grid(rig: Rig, count: int, speed: float) -> None:
         true = differences(even, by_arrival, rig.limits)
         print(f"read each 2 ms: {100 * np.mean(read > 1.1):.2f} % of cycles above the limit, largest {read.max():.1f}; "
               f"by arrival over 20 ms: largest {true.max():.2f}; {rig.executor.arm.status.state}, "
-              f"{rig.executor.arm.resumed} interruptions", flush=True)
+              f"{rig.executor.arm.gaps.resumed} interruptions", flush=True)
 
 
 def main() -> None:

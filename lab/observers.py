@@ -10,7 +10,8 @@ from typing import Any
 from common import topics
 from common.config import Cell, HardwareConfig, Parameters, RobotConfig
 from common.errors import ConfigError
-from common.hardware.interface import Gripper, Hardware, Limits, SensingArm, Vector, find_backend, load_hardware
+from common.hardware.backends import find_backend, load_hardware
+from common.hardware.interface import Gripper, Hardware, Limits, SensingArm, Vector
 from common.messages import SupervisorStatus
 from common.transport.codec import decode, decode_attachment
 from common.transport.reader import SequenceFilter

@@ -31,12 +31,11 @@ from common.time_source import monotonic
 from common.transport.endpoint import peer_group
 from page.access import CURRENT_SESSION, Access, Answer, PageSession, Permissions, gateways
 from page.address import is_loopback, listen_error, open_socket
+from page.viser_client import ClientFile, client_files
 from page.viser_inside import (
     CONTROL_PATH,
-    ClientFile,
     RequestCheck,
     SocketHandler,
-    client_files,
     create_server,
     filter_messages,
     silence_console,

@@ -23,7 +23,7 @@ from common.control.motion_authority import OrphanPolicy, WhenAlone
 from common.control.request_handlers import MAX_STOPS, RequestHandlers
 from common.control.status import Report
 from common.control.trajectory import Tolerances
-from common.hardware.interface import has_simulated_world, real_arm
+from common.hardware.backends import has_simulated_world, real_arm
 from common.messages import MotionOwner, MotionStatus
 from common.process.hosted_arms import create_executors, hosted_arms
 from common.process.reservation import Reservation

@@ -70,7 +70,7 @@ def load(server: viser.ViserServer, config: Config, layers: Layers, page: Page) 
     from common.planning.planners import planner_names
     from common.robot.model import RobotModel
     from page.scene import Scene
-    from page.viser_inside import client_files
+    from page.viser_client import client_files
 
     client_files()  # fills a cache
     robot = RobotModel.load(config.robot)

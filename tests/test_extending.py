@@ -21,7 +21,8 @@ from common import messages as m
 from common.application import find_application
 from common.config import load_cell, service_config
 from common.errors import ConfigError
-from common.hardware.interface import Limits, load_hardware
+from common.hardware.backends import load_hardware
+from common.hardware.interface import Limits
 from common.planning.planners import load_planner
 from common.process.in_process import running_service
 from common.robot.model import RobotModel

@@ -12,7 +12,7 @@ from common import messages as m
 from common.config import Parameters, RobotConfig, Scenery
 from common.config.basics import Length, Point
 from common.errors import ConfigError
-from common.hardware.interface import is_simulated
+from common.hardware.backends import is_simulated
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix, rpy_to_matrix
 from common.sim.interface import KINEMATIC
 from common.tasks.force import Insert

@@ -14,7 +14,7 @@ from applications.pick_place.grasping import RELEASED
 from common.application import Checks
 from common.config import CameraConfig, Cell, Container, ObjectConfig, Reach, service_config
 from common.config.basics import Rgb
-from common.hardware.interface import has_simulated_world
+from common.hardware.backends import has_simulated_world
 from common.perception.pinhole import Pinhole
 from common.planning.ik import controls_full_pose
 from common.robot.transforms import tool_down

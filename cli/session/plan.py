@@ -115,7 +115,7 @@ class SessionPlan:
 
     @property
     def _simulated(self) -> bool:
-        from common.hardware.interface import is_simulated
+        from common.hardware.backends import is_simulated
 
         return is_simulated(self.cell.robot)
 

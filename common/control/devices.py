@@ -1,4 +1,4 @@
-"""Devices behind the hardware seam: checked readings, faults that are states with a reason, and the payload.
+"""Devices behind the hardware seam: checked readings, and faults that are states with a reason.
 
 A device that fails is left alone for a while, longer each time, and the fault is logged once.
 """
@@ -10,10 +10,8 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from common.config import GripperConfig
 from common.errors import Refused
 from common.hardware.interface import (
-    ControlledArm,
     Gripper,
     GripperReading,
     Hardware,
@@ -123,29 +121,3 @@ class DeviceFault:
             return ""
         before, self._noted = self._noted, self.reason
         return f"{self.device} does not work: {self.reason}" if self.reason else f"{self.device} works again ({before})"
-
-
-class PayloadReporter:
-    """Sends the arm's own controller the payload at rest: changed in motion, it may cause a protective stop."""
-
-    def __init__(self, arm: ControlledArm | None, gripper: GripperConfig | None) -> None:
-        """Send it to this arm, if it has a controller and the robot file gives the mass of the gripper."""
-        self._arm, self._payload = arm, gripper.payload if gripper is not None else None
-        self._sent: float | None = None  # held mass that the controller knows [kg]
-        self._order = 0  # number of that order
-        self._failed = False  # it is sent again after the next motion
-
-    def update(self, held: float, ready: bool, at_rest: bool) -> None:
-        """Send the held mass [kg] when it changes, and when the controller has become ready."""
-        if not ready or (self._failed and not at_rest):
-            self._sent, self._failed = None, False
-        elif at_rest and self._arm is not None and self._payload is not None and held != self._sent and not self._order:
-            self._sent = held
-            self._order = self._arm.order("payload", *self._payload.with_held(held))
-
-    def pop_log_line(self) -> str:
-        """Return a line for the log if it could not be sent since the last call; else ""."""
-        if self._arm is None or not self._order or (outcome := self._arm.outcome(self._order)) is None:
-            return ""
-        self._order, self._failed = 0, bool(outcome)
-        return outcome and f"the arm did not accept its payload: {outcome}"

@@ -7,37 +7,34 @@ changed. Requests are checked by the motion authority, which knows interlocks an
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from common.config import GripperConfig
-from common.control.devices import DeviceFault, PayloadReporter, call_device, read_gripper, read_joints
+from common.control.devices import DeviceFault, call_device, read_joints
 from common.control.force_requests import FORCE_LIMITS, ForceLimits, ForceRequests
 from common.control.force_sensing import ForceSensing
 from common.control.goals import Assessment, ForceControl
+from common.control.gripper_commands import GripperCommands
 from common.control.gripper_controller import DeferredCommand, GripperController
 from common.control.interlocks import Interlocks
 from common.control.jogging import Jogging, ToolKinematics
 from common.control.joining import Join
 from common.control.motion_authority import MotionAuthority
-from common.control.status import ChangeDetector, Report, joint_state, robot_fields
+from common.control.status import ChangeDetector, Report, joint_state
 from common.control.trajectory import Tolerances, Trajectory
 from common.control.trajectory_controller import PERIOD, TrajectoryController
+from common.control.vendor_controller import VendorController
 from common.control.wrench import Wrenches
 from common.errors import ConfigError, Refused
 from common.hardware.interface import (
-    SAFETY_STOPS,
-    ControlledArm,
     Hardware,
     HardwareFault,
     Interrupted,
     Limits,
     PersistedState,
-    SlowedArm,
     Vector,
     WorldBackend,
 )
 from common.messages import (
-    CLOSED_BEFORE,
     ConveyorSet,
     ConveyorState,
     ExecuteRequest,
@@ -48,7 +45,6 @@ from common.messages import (
     JogCommand,
     JointState,
     MotionStatus,
-    RobotCommand,
     RobotStatus,
     SetPoints,
 )
@@ -64,6 +60,7 @@ class Executor:
         force: the wrench at the tool in this cycle.
         world: the simulated world; None with real hardware.
         force_motions: checks force motions and watches their requester.
+        vendor: the arm's own controller, which only real arms have.
     """
 
     def __init__(
@@ -93,26 +90,21 @@ class Executor:
         self._hardware, self._limits, self._gripper_config = hardware, limits, gripper
         self.world, self.force = world, force or ForceSensing(hardware)
         self.arm = TrajectoryController(limits, start, tolerances, name=controller, period=period)
-        self.gripper = None
-        if gripper is not None and hardware.gripper is not None:
-            self.gripper = GripperController(hardware.gripper, gripper)
-        self._deferred = DeferredCommand(self.arm, kinematics)
         self._q = start.copy()
         self._was_read = False  # whether the position of the arm is known
-        self._width_rate = 0.0
         self._speed_scaling = 1.0  # as operators and programs set it
         self._followed: ExecuteRequest | None = None  # newest accepted goal
-        self._controlled = hardware if isinstance(hardware, ControlledArm) else None
-        self._slowed = hardware if isinstance(hardware, SlowedArm) else None  # isinstance takes long for a protocol
-        self._payload = PayloadReporter(self._controlled, gripper)
-        self._arm_fault, self._gripper_fault = DeviceFault("the arm"), DeviceFault("the gripper")
+        self._arm_fault = DeviceFault("the arm")
         self._changes = ChangeDetector(self.arm)
         self._interlocks = interlocks or Interlocks()
         self.force_motions = ForceRequests(limits, kinematics, force_limits, period)
-        if self._controlled is not None:
-            self.arm.history.delay, self.arm.bridges = self._controlled.delay, self._controlled.ahead
-            self._controlled.stopped = self._controlled.stopped or self._interlocks.arm_stopped
+        self.vendor = VendorController(hardware, self.arm, self._interlocks, gripper)
         self.authority = MotionAuthority(self.arm, Jogging(limits, kinematics), self._interlocks)
+        self.gripper, self._commands = None, None
+        if gripper is not None and hardware.gripper is not None:
+            self.gripper = GripperController(hardware.gripper, gripper)
+            self._commands = GripperCommands(
+                hardware.gripper, self.gripper, DeferredCommand(self.arm, kinematics), self.arm, self.authority, world)
 
     # --- the cycle ------------------------------------------------------------------------------------------------
 
@@ -128,10 +120,9 @@ class Executor:
                 self.arm.fault(str(fault))
                 self.force.lose(str(fault))
                 self.authority.interrupt_jogging()
-        if self.gripper is not None:
-            self._update_deferred(self.gripper, now)
-        if self._controlled is not None:
-            self._interlocks.arm_stopped = self._controlled.stopped
+        if self._commands is not None:
+            self._commands.update_deferred(now, self._q)
+        self.vendor.note_stop()
         moving = self.gripper is not None and self.gripper.state.moving
         self.authority.update(bool(self.arm.goal) or not self.arm.at_rest or moving)
         self._report_changes(report, header)
@@ -145,87 +136,37 @@ class Executor:
         """
         self._q, dq = read_joints(self._hardware, len(self._q), now)
         self._was_read = True
-        try:
-            self._update_gripper(now)
-        except HardwareFault as fault:
-            self._fail_gripper(fault, now)
-            if self.gripper is not None:
-                self.gripper.fault(str(fault))
+        if self._commands is not None:
+            self._commands.read(now, self._q)
         held = self.gripper.held_mass if self.gripper is not None else 0.0
         self.force.update(now, self._q, dq, held, self.arm.at_rest)
-        if self._controlled is None or self._update_controlled_arm(self._controlled):
-            slider = self._controlled.state.speed if self._controlled is not None else 1.0
-            self.arm.jog(self.authority.jog_velocity(self._speed_scaling), slider)
+        if self.vendor.update(held, self._speed_scaling):
+            self.arm.jog(self.authority.jog_velocity(self._speed_scaling), self.vendor.slider)
             if gone := self.force_motions.sense(self.arm, self._q, Wrenches.of(self.force.estimator)):
                 self.arm.abort("requester_gone", gone)
             set_points = self.arm.update(now, self._q, dq)
             if set_points is not None:
                 self._send(*set_points, now)
+        else:
+            self.authority.interrupt_jogging()
         width = self.gripper.state.width if self.gripper is not None else 0.0
-        return joint_state(header, self._limits.names, self._q, dq, self._gripper_config, width, self._width_rate)
+        rate = self._commands.width_rate if self._commands is not None else 0.0
+        return joint_state(header, self._limits.names, self._q, dq, self._gripper_config, width, rate)
 
     def _send(self, positions: Vector, velocities: Vector, now: float) -> None:
-        if self._slowed is not None:
-            self._slowed.share = self.arm.share_of_speed(velocities, self._speed_scaling)
+        self.vendor.set_share(velocities, self._speed_scaling)
         try:
             call_device("sending set-points", self._hardware.write, positions, velocities, now)
             self._arm_fault.clear(now)
         except Interrupted as reason:
             self.arm.interrupt(str(reason), now)
 
-    def _update_controlled_arm(self, arm: ControlledArm) -> bool:
-        """Return whether the arm's own controller accepts set-points."""
-        state, self.arm.history.delay = arm.state, arm.delay
-        self.arm.reports.speed_scaling = self._speed_scaling * state.speed
-        held = self.gripper.held_mass if self.gripper is not None else 0.0
-        self._payload.update(held, state.mode == "running", self.arm.at_rest)
-        if state.mode == "running":
-            return True
-        self.arm.fault(state.message or state.mode)  # no pause: its state says when it is over
-        self.authority.interrupt_jogging()
-        return False
-
-    def _update_gripper(self, now: float) -> None:
-        gripper = self._hardware.gripper
-        if self.gripper is None or gripper is None or self._gripper_fault.is_paused(now):
-            return
-        if self.world is not None:
-            self.world.obstruct(self._q)
-        reading = read_gripper(gripper, now)
-        if self.world is not None:
-            self.world.step(now, self._q, reading)
-        self._width_rate = reading.velocity
-        self.gripper.update(reading, now)
-        self._gripper_fault.clear(now)
-
-    def _fail_gripper(self, fault: HardwareFault, now: float) -> None:
-        """Brake the arm along its path: the gripper does not work."""
-        self._gripper_fault.set(str(fault), now)
-        self.arm.abort("hardware_fault", str(fault), "hardware")
-
-    def _update_deferred(self, gripper: GripperController, now: float) -> None:
-        """Start or cancel a deferred gripper command; stop an arm that arrives late for closing fingers."""
-        waiting = self._deferred.command
-        blocked = waiting and self.authority.check_interlocks(waiting, waiting.id)
-        if waiting is not None and blocked:
-            self._deferred.take()
-            gripper.cancel_deferred(waiting, str(blocked))
-        elif waiting is not None and self._deferred.is_due(now, self._q, gripper.state.width):
-            try:
-                gripper.start(waiting, now)
-            except HardwareFault as fault:
-                self._fail_gripper(fault, now)
-                gripper.cancel_deferred(waiting, str(fault), "hardware_fault")
-        if self._deferred.closed_early(now):
-            self.arm.abort(CLOSED_BEFORE, "held up or slowed as the fingers began to close")
-        if failed := self._deferred.take_failed():
-            gripper.cancel_deferred(*failed)
-
     def _report_changes(self, report: Report, header: Header) -> None:
         report.wrench = self.force.due(header)
-        report.robot = self._changes.robot(header, self._robot_fields, self._late)
-        report.notes = [*filter(None, (self._arm_fault.pop_log_line(), self._gripper_fault.pop_log_line(),
-                                       self.arm.pop_log_line(), self._payload.pop_log_line()))]
+        report.robot = self._changes.robot(header, self.vendor.fields(self._arm_fault.reason), self.vendor.late)
+        gripper_line = self._commands.fault.pop_log_line() if self._commands is not None else ""
+        report.notes = [*filter(None, (self._arm_fault.pop_log_line(), gripper_line, self.arm.pop_log_line(),
+                                       self.vendor.pop_log_line()))]
         report.owner = self.authority.changed_owner(header)
         report.motion = self.changed_motion(header)
         if self.gripper is not None:
@@ -282,9 +223,10 @@ class Executor:
         return status
 
     def _check_devices(self) -> Refused | None:
-        if self._gripper_fault.check() is None and not self._was_read and not self._arm_fault.reason:
+        fault = self._commands.fault.check() if self._commands is not None else None
+        if fault is None and not self._was_read and not self._arm_fault.reason:
             return Refused("hardware_fault", "no joint reading received yet")
-        return self._gripper_fault.check()
+        return fault
 
     def jog(self, request: JogCommand, refusal: Refused | None = None) -> None:
         """Jog the arm until the next command is overdue, unless there is a `refusal` already.
@@ -312,34 +254,9 @@ class Executor:
         Raises:
             Refused: this robot has no gripper.
         """
-        if self.gripper is None:
+        if self._commands is None:
             raise Refused("no_gripper", "this robot has no gripper")
-        refusal = (self.authority.check_interlocks(request, request.id) or refusal
-                   or self.authority.check_owner(request.owner) or self._gripper_fault.check())
-        deferred = bool(request.after) and request.after == self.arm.goal
-        if request.after and not deferred and self.arm.fails(request.after):
-            refusal = refusal or Refused("unknown_goal", f"goal {request.after!r} is not followed now")
-        try:
-            known = self.gripper.knows(request.id)
-            state = self.gripper.command(request, now, refusal, deferred)
-            if not known:
-                self.authority.note_refusal(request, state)
-            if not known and state.state == "active":
-                self._replace_deferred(self.gripper, request)
-                if deferred:
-                    self._deferred.wait(request)
-            if refusal is None:
-                self.authority.use(request.owner)
-            return state
-        except HardwareFault as fault:
-            self._gripper_fault.set(str(fault), now)
-            self.gripper.fault(str(fault))
-            self._replace_deferred(self.gripper, request)
-            return self.gripper.command(request, now, self._gripper_fault.check())
-
-    def _replace_deferred(self, gripper: GripperController, request: GripperCommand) -> None:
-        if (replaced := self._deferred.take()) is not None:
-            gripper.cancel_deferred(replaced, f"replaced by {request.id!r}")
+        return self._commands.command(request, now, refusal)
 
     def set_conveyor(self, request: ConveyorSet, header: Header, refusal: Refused | None = None) -> ConveyorState:
         """Start or stop a belt, by the rules of motion; stopping is open to everyone.
@@ -355,39 +272,10 @@ class Executor:
                 raise refusal
         return self.world.set_conveyor(request, header)
 
-    def order(self, request: RobotCommand) -> int:
-        """Start a function of the arm's own controller; return a number for `outcome`.
-
-        Raises:
-            Refused: it has no controller, a goal is being followed, or the arm is in a safety stop (`enable`) or
-                without power (`recover`).
-        """
-        if self._controlled is None:
-            raise Refused("no_controller", "this arm has no controller of its own that could do that")
-        if request.act == "freedrive" and request.value and self.arm.goal:
-            raise Refused("busy", f"goal {self.arm.goal!r} is still being followed: stop it first")
-        state = self._controlled.state
-        if state.mode in {"enable": SAFETY_STOPS, "recover": ("off",)}.get(request.act, ()):
-            raise Refused("robot", f"{request.act}: {state.message or state.mode.replace('_', ' ')}")
-        return self._controlled.order(request.act, *request.values)
-
-    def order_outcome(self, number: int) -> str | None:
-        """Return the outcome of an order to the arm's controller, once: "" or the reason of its failure; else None."""
-        assert self._controlled is not None
-        return self._controlled.outcome(number)
-
     @property
     def robot(self) -> RobotStatus:
         """State of the arm."""
-        return RobotStatus(**self._robot_fields, late=self._late)
-
-    @property
-    def _robot_fields(self) -> dict[str, Any]:
-        return robot_fields(self._controlled, self._arm_fault.reason, self.arm.resumed)
-
-    @property
-    def _late(self) -> float:
-        return 0.0 if self._controlled is None else self._controlled.late
+        return RobotStatus(**self.vendor.fields(self._arm_fault.reason), late=self.vendor.late)
 
     @property
     def speed_scaling(self) -> float:
@@ -397,8 +285,7 @@ class Executor:
     @speed_scaling.setter
     def speed_scaling(self, share: float) -> None:
         self._speed_scaling = share
-        slider = self._controlled.state.speed if self._controlled is not None else 1.0
-        self.arm.reports.speed_scaling = share * slider
+        self.arm.reports.speed_scaling = share * self.vendor.slider
 
     def set_points(self, header: Header) -> SetPoints:
         """Return what was commanded last."""

@@ -290,7 +290,7 @@ class RequestHandlers:
             raise refusal  # it does not recover from a stop after the request
         if request.act == "freedrive" and request.value and self.permission is not None:
             raise Refused("several_arms", "an arm next to others is not moved by hand: nothing proves where it goes")
-        self._orders[number := self._executor.order(request)] = asyncio.get_running_loop().create_future()
+        self._orders[number := self._executor.vendor.order(request)] = asyncio.get_running_loop().create_future()
         if outcome := await self._orders[number]:
             raise Refused("robot", f"{request.act}: {outcome}")
         return self._executor.robot.model_copy(update={"header": self._header()})
@@ -343,7 +343,7 @@ class RequestHandlers:
         if self._world is not None:
             self._world.start_step()
         for number in list(self._orders):
-            outcome = self._executor.order_outcome(number)
+            outcome = self._executor.vendor.outcome(number)
             if outcome is not None and not (order := self._orders.pop(number)).done():
                 order.set_result(outcome)
 

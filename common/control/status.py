@@ -9,7 +9,7 @@ import numpy as np
 
 from common.config import GripperConfig
 from common.control.trajectory_controller import TrajectoryController
-from common.hardware.interface import ControlledArm, Vector
+from common.hardware.interface import Vector
 from common.messages import (
     ConveyorState,
     GripperState,
@@ -85,15 +85,6 @@ class ChangeDetector:
             return None
         self._gripper, self._gripper_at = state, now
         return state.model_copy(update={"header": header})
-
-
-def robot_fields(arm: ControlledArm | None, fault: str, resumed: int = 0) -> dict[str, Any]:
-    """Return the published state of the arm; one without a controller of its own runs, unless it has a fault."""
-    if arm is None:
-        return {"mode": "fault" if fault else "running", "message": fault}
-    state = arm.state
-    return {"mode": state.mode, "message": state.message, "speed": state.speed, "inputs": state.inputs,
-            "outputs": state.outputs, "controller": True, "resumed": resumed}
 
 
 def joint_state(

@@ -16,7 +16,8 @@ from common.control.interlocks import InterlockStore
 from common.control.trajectory import Tolerances
 from common.control.wrench import Payload
 from common.errors import ConfigError
-from common.hardware.interface import ControlledArm, Hardware, Limits, Vector, has_simulated_world, load_hardware
+from common.hardware.backends import has_simulated_world, load_hardware
+from common.hardware.interface import ControlledArm, Hardware, Limits, Vector
 from common.robot.model import RobotModel
 from common.robot.tool_mass import described_tool
 from common.scene.workspace import configured_bounds

@@ -11,7 +11,8 @@ import numpy as np
 from applications.policy.interface import Observation
 from applications.policy.sources.settings import PolicyCell
 from common.config import Cell, load_cell
-from common.hardware.interface import Limits, load_hardware
+from common.hardware.backends import load_hardware
+from common.hardware.interface import Limits
 from common.messages import Header, PlanningScene, PlanRequest, Vector3, WorldEdit
 from common.perception.pinhole import Pinhole
 from common.planning.pipeline import PlanningPipeline

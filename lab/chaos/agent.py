@@ -19,7 +19,7 @@ from common import topics
 from common.application import all_topics, find_application
 from common.config import Cell, World
 from common.errors import DecodeError, RequestFailed
-from common.hardware.interface import has_simulated_world
+from common.hardware.backends import has_simulated_world
 from common.messages import Message, WorldEdit
 from common.supervision.supervisor import Supervisor
 from common.time_source import monotonic

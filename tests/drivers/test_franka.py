@@ -11,8 +11,9 @@ import ruckig
 
 from common.config import RobotConfig, load_cell
 from common.control.gripper_controller import GripperController
+from common.hardware.backends import load_hardware
 from common.hardware.driven_gripper import DrivenGripper
-from common.hardware.interface import HardwareFault, Limits, load_hardware
+from common.hardware.interface import HardwareFault, Limits
 from common.messages import GripperCommand
 from common.robot.model import RobotModel
 from tests.doubles.franka_host import PYTHON, FrankaHost

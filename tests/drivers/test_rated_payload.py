@@ -8,9 +8,10 @@ import pytest
 
 from common.config import load_cell
 from common.errors import ConfigError
+from common.hardware.backends import load_hardware
 from common.hardware.driven_arm import DrivenArm
 from common.hardware.driver_process import DriverProcess
-from common.hardware.interface import Limits, load_hardware
+from common.hardware.interface import Limits
 
 RATED = {"ur3": 3, "ur5": 5, "ur10": 10, "ur3e": 3, "ur5e": 5, "ur7e": 7.5, "ur10e": 12.5, "ur12e": 12.5, "ur15": 15,
          "ur16e": 16, "ur20": 20, "ur30": 35, "franka": 3}

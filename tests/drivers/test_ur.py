@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from common.errors import ConfigError
+from common.hardware.backends import has_simulated_world, is_simulated, real_arm
 from common.hardware.driven_arm import DrivenArm, Reading
-from common.hardware.interface import Limits, has_simulated_world, is_simulated, real_arm
+from common.hardware.interface import Limits
 from drivers.ur import Options, create
 from drivers.ur_wrench import at_flange
 from tests.common.hardware.test_backends import robot

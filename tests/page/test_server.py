@@ -28,7 +28,8 @@ from page import server as page_server
 from page.access import Permission, Permissions, cookie_value
 from page.console import ActionQueue
 from page.server import close_server, make_server
-from page.viser_inside import client_files, element_id
+from page.viser_client import client_files
+from page.viser_inside import element_id
 from security.page_tokens import ROLES, TOKEN_VARIABLE
 from services.viewer import Config
 from tests.page.fake_browser import CAMERA

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from common.application import find_application
 from common.config import Cell, GripperConfig, RobotConfig, Surroundings, located
 from common.errors import ConfigError, ZencellError
-from common.hardware.interface import has_simulated_world, real_arm
+from common.hardware.backends import has_simulated_world, real_arm
 from common.messages import TaskStatus
 from common.robot.finger_joints import driven_position
 from common.robot.urdf import merged_urdf

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from common.application import Application
 from common.config import Cell, Container, GripperConfig, ObjectConfig, World
-from common.hardware.interface import has_simulated_world
+from common.hardware.backends import has_simulated_world
 from common.perception.pinhole import Pinhole
 from common.sim.footprints import overlap, within
 from common.sim.objects import Solid, initial_pose, solid_of

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.control.trajectory_controller import LATE
+from common.control.set_point_gaps import LATE
 from common.hardware.interface import HardwareFault
 from common.hardware.mock import MockHardware
 from common.planning.path import blended_path

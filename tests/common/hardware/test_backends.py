@@ -8,7 +8,7 @@ import pytest
 
 from common.config import HardwareConfig, Parameters, RobotConfig, load_cell
 from common.errors import ConfigError, UnknownName
-from common.hardware import interface as loading
+from common.hardware import backends as loading
 from common.hardware.driven_gripper import DrivenGripper
 from common.hardware.driver_process import DriverProcess
 from common.hardware.interface import Limits

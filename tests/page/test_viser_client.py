@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from viser._messages import RunJavascriptMessage
 from viser.infra._async_message_buffer import AsyncMessageBuffer
 
-from page.viser_inside import ALPHABET, client_files, decode_base88, overlay, unpack_client
+from page.viser_client import ALPHABET, client_files, decode_base88, overlay, unpack_client
 
 PAGE = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_text(encoding="utf-8")
 
