@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from cli import options
+from cli import options, verbs
 from cli.options import CommandGroup
 from common.supervision.multi_host import HostOptions
 from common.terminal import echo
@@ -20,13 +21,20 @@ DAYS = 365
 SHOWN = ("writes", "reads", "answers", "asks", "passes on")
 
 Folder = Annotated[str, typer.Argument(metavar="DIR", help="of the certificates")]
+Cells = Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="or a program; repeatable; default: all "
+                                                                               "of config/cells")]
+
+
+def _resolved(given: str, overrides: Sequence[str] | None, world: str | None = None) -> tuple[str, list[str]]:
+    """Return the cell and its overrides as for `zencell run`: a program replaces the task of its cell."""
+    resolved = verbs.before_run(given, list(overrides or ()), world, {})
+    return resolved.cell or given, resolved.overrides
 
 
 @app.command()
 def init(
     folder: Folder,
-    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="all of config/cells if not given; "
-                                                    "repeatable")] = None,
+    cells: Cells = None,
     hosts: Annotated[list[str] | None, typer.Option("--host", metavar="NAME", help="name or address at which the "
                                                     "router is reached from elsewhere; repeatable; with --renew the "
                                                     "previous ones if not given")] = None,
@@ -43,7 +51,7 @@ def init(
 
     valid = options.whole("--days", days, 1)
     assert valid is not None
-    loaded = [load_cell(name, overrides or ()) for name in cells or names_of("cells")]
+    loaded = [load_cell(*_resolved(name, overrides)) for name in cells or names_of("cells")]
     with_page = [cell.name for cell in loaded if any(entry.kind == VIEWER for entry in cell.services.values())]
     place = Path(folder)
     made = make(place, {cell.name: rights_in(cell) for cell in loaded}, with_page, hosts or (), valid, renew=renew)
@@ -112,8 +120,7 @@ def show(folder: Folder, as_json: options.Json = False) -> None:
 @app.command()
 def check(
     folder: Folder,
-    cells: Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="all of config/cells if not given; "
-                                                    "repeatable")] = None,
+    cells: Cells = None,
     overrides: options.Overrides = None,
     world: options.WorldName = None,
     seed: options.Seed = None,
@@ -132,7 +139,7 @@ def check(
         raise ConfigError("--only", ",".join(only), "needs the one cell that they are services of: --cell CELL")
     place, number = Path(folder), options.whole("--seed", seed, 0)
     for given in cells or names_of("cells"):
-        cell = load_cell(given, overrides or (), world=world, seed=number)
+        cell = load_cell(*_resolved(given, overrides, world), world=world, seed=number)
         again = renewal(folder, given)
         rights = rights_in(cell, [entry.name for entry in HostOptions(only=only).part_of(cell).services.values()])
         if not only_rules:

@@ -233,7 +233,8 @@ class PolicyTask:
     def _figures(self) -> dict[str, bool | int | float | str | None]:
         status = self.status
         counts = {name: getattr(status, name) for name in COUNTED}
-        return {**counts, "violations": ", ".join(f"{cause} {count}" for cause, count in self.causes.most_common()),
+        causes = ", ".join(f"{cause} {count}" for cause, count in self.causes.most_common()) or "none"
+        return {**counts, "violations": causes,
                 "inference_ms": round(status.inference_ms, 1), "proof_ms": round(status.proof_ms, 1)}
 
     def _find(self, motion: m.MotionStatus) -> None:

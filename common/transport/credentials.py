@@ -21,7 +21,7 @@ SECURE_VARIABLE = "ZENCELL_SECURE"  # folder of certificates
 AUTHORITY, ROUTER_NAME, ACCESS = "ca", "router", "access.json5"
 SUPERVISOR, RECORDER = "supervisor", "recorder"  # in each cell, besides its services
 OPERATOR, OBSERVER = "operator", "observer"  # tools of people, for all cells
-REMEDY = "make it with `zencell secure init`"
+REMEDY = "make it with `zencell secure init DIR --cell CELL`, where CELL is the cell or program to run"
 
 WARNING_TIME, URGENT_TIME = datetime.timedelta(days=30), datetime.timedelta(days=1)  # before a certificate expires
 PERIOD = 3600.0  # [s] between two checks of the files

@@ -12,7 +12,7 @@ from common.config import load_cell
 from common.errors import ConfigError
 from common.supervision.launch import Launch
 from common.supervision.multi_host import HostOptions
-from common.transport.credentials import ACCESS
+from common.transport.credentials import ACCESS, REMEDY
 from security.certificates import Authority
 from security.preflight import require_secured
 from tests.harness import free_domain
@@ -61,14 +61,14 @@ def test_missing_folder_is_named_with_the_command_that_creates_one(refusal: Refu
 def test_each_process_that_is_started_needs_its_files(refusal: Refusal, folder: Path, missing: str) -> None:
     (folder / missing).unlink()
     line = refusal("run", "panda", "--only", "viewer")
-    assert line == f"--secure: '{folder}' has no {missing}: make it with `zencell secure init`"
+    assert line == f"--secure: '{folder}' has no {missing}: {REMEDY}"
 
 
 def test_recorder_that_is_started_needs_its_own_certificate(refusal: Refusal, folder: Path, monkeypatch) -> None:
     (folder / "panda.recorder.key").unlink()
     monkeypatch.setattr("security.preflight._require_rules", lambda *_: None)  # in another process
     line = refusal("run", "panda", "--only", "robot_state_publisher", "--record", "all.mcap")
-    assert line == f"--secure: '{folder}' has no panda.recorder.key: make it with `zencell secure init`"
+    assert line == f"--secure: '{folder}' has no panda.recorder.key: {REMEDY}"
 
 
 def test_expired_certificate_is_named_with_its_date_and_the_remedy(refusal: Refusal, folder: Path) -> None:

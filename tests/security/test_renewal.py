@@ -56,3 +56,12 @@ def test_existing_certificates_are_not_overwritten_by_mistake(folder: Path, caps
     (folder / "ca.key").unlink()
     assert refusal("--renew") == "--renew: 'certs' has no ca.key to sign with"
     assert (folder / "router.pem").read_bytes() == before
+
+
+def test_runner_of_a_program_gets_a_certificate_in_place_of_the_task(folder: Path) -> None:
+    (folder.parent / "wave.yaml").write_text("cell: panda\nsteps: [{step: move, to: home}]\n")
+    assert app.execute(["secure", "init", "certs", "--cell", "wave.yaml"]) == 0
+    require_valid(folder, ["router", "panda.program_runner", "panda.motion_planner"], "")
+    assert not (folder / "panda.smart_pick_place.pem").exists()
+    assert app.execute(["secure", "check", "certs", "--cell", "wave.yaml"]) == 0
+    assert app.execute(["secure", "check", "certs", "--cell", "panda"]) == 2
