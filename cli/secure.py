@@ -21,8 +21,8 @@ DAYS = 365
 SHOWN = ("writes", "reads", "answers", "asks", "passes on")
 
 Folder = Annotated[str, typer.Argument(metavar="DIR", help="of the certificates")]
-Cells = Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="or a program; repeatable; default: all "
-                                                                               "of config/cells")]
+Cells = Annotated[list[str] | None, typer.Option("--cell", metavar="CELL", help="or a program; repeatable; default: "
+                                                                               "all of config/cells")]
 
 
 def _resolved(given: str, overrides: Sequence[str] | None, world: str | None = None) -> tuple[str, list[str]]:
