@@ -11,6 +11,7 @@ import argparse
 import json
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +31,17 @@ DEEP_ENOUGH = 0.0145  # [m] by the truth
 STILL = 1e-3  # [m/s] of the TCP
 
 
-def contact(seed: int) -> dict[str, Any]:
-    """Touch the table with closed fingers, at a random place, speed (5 to 14 mm/s) and force (3 to 15 N)."""
+def contact(seed: int, speed: float | None = None) -> dict[str, Any]:
+    """Touch the table with closed fingers, at a random place, speed (5 to 14 mm/s if not given) and force (3 to 15 N).
+
+    The hand, 0.2 m wide, passes the peg.
+    """
     rng, rig = np.random.default_rng(seed), Rig()
     rig.grip(0.0)
     rig.width = 0.0
-    speed, force = float(rng.uniform(0.005, 0.014)), float(rng.uniform(3.0, 15.0))
-    rig.move(tool_down(rng.uniform(0.40, 0.62), rng.uniform(-0.08, 0.07), rng.uniform(0.03, 0.04)))
+    drawn, force = float(rng.uniform(0.005, 0.014)), float(rng.uniform(3.0, 15.0))
+    speed = drawn if speed is None else speed
+    rig.move(tool_down(rng.uniform(0.40, 0.62), rng.uniform(-0.02, 0.07), rng.uniform(0.03, 0.04)))
     rig.zero()
     steps: list[tuple[float, float, float]] = []
     offset = rig.now - rig.data.time  # between the clock of control and that of physics [s]
@@ -90,7 +95,7 @@ def insertion(seed: int) -> dict[str, Any]:
 def report(rows: Sequence[dict[str, Any]]) -> None:
     """Print medians, largest values, and shares with their intervals."""
     for kind, good, values in (
-        ("contact", lambda row: row["state"] == "succeeded" and row["over_n"] >= 0.0,  # else the hand met the peg
+        ("contact", lambda row: row["state"] == "succeeded" and row["over_n"] >= 0.0,
          ("set_points_ms", "standstill_ms", "over_n", "over_mm", "rest_n")),
         ("insertion", lambda row: row["inserted"],
          ("seconds", "depth_mm", "start_off_mm", "most_n", "penetration_mm", "usual_penetration_mm")),
@@ -114,17 +119,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--contacts", type=int, default=20, metavar="COUNT")
     parser.add_argument("--insertions", type=int, default=20, metavar="COUNT")
+    parser.add_argument("--speed", type=float, metavar="M_PER_S", help="of all contacts; a file is for one speed")
     parser.add_argument("--first", type=int, default=1, metavar="SEED")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
     rows = [] if options.json is None or not options.json.exists() else [
         json.loads(line) for line in options.json.read_text(encoding="utf-8").splitlines()]
     known = {(row["kind"], row["seed"]) for row in rows}
-    runs: list[tuple[Callable[[int], dict[str, Any]], int]] = [
-        (contact, options.contacts), (insertion, options.insertions)]
-    for run, count in runs:
+    runs: list[tuple[str, Callable[[int], dict[str, Any]], int]] = [
+        ("contact", partial(contact, speed=options.speed), options.contacts),
+        ("insertion", insertion, options.insertions)]
+    for kind, run, count in runs:
         for seed in range(options.first, options.first + count):
-            if (run.__name__, seed) in known:
+            if (kind, seed) in known:
                 continue
             rows.append(row := run(seed))
             print(json.dumps(row), flush=True)

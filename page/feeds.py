@@ -137,7 +137,7 @@ class Topics:
         controls = getattr(page.controls, "TOPICS", ())
         displayed = [topic for part in parts for topic in part.TOPICS]
         images = [topic for each in self.images.values() for topic in each]
-        self.on_demand: list[Topic[Any]] = [*images, *controls, *displayed]
+        self.on_demand: list[Topic[Any]] = [topics.WRENCH, *images, *controls, *displayed]
 
     @property
     def always(self) -> list[Topic[Any]]:

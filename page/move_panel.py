@@ -23,7 +23,7 @@ from page.goal_fields import JOINTS, MARKER, TOOL, Goal, GoalFields, GoalScene, 
 from page.manual_control import ArmReadout, GripperPanel, Jogger, JogPanel
 from page.markup import Html, block, buttons, press, span, text
 from page.saved_poses import SavedPosesPanel
-from page.status_text import USER_ERRORS, arm_blocked, error_text, jog_blocked, plan_text
+from page.status_text import USER_ERRORS, arm_blocked, error_text, jog_blocked, plan_text, wrench_text
 
 if TYPE_CHECKING:
     from common.robot.model import RobotModel
@@ -87,7 +87,7 @@ class MovePanel:
         console.on_press("home", self.go_home, "Go to home pose")
         self._jog = JogPanel(gui, console, robot.joint_names, robot.velocity.tolist())
         self.jogger = Jogger(console, self._jog.velocities, self._state, lambda: self._blocked)
-        gripper = robot.config.gripper
+        gripper, self._force_limit = robot.config.gripper, robot.config.force_limit
         self._gripper: GripperPanel | None = None
         if gripper is not None:
             with gui.add_folder("Gripper width and force", expand_by_default=False):
@@ -135,9 +135,10 @@ class MovePanel:
         if self._gripper is not None:
             self._gripper.show(self._blocked)
         home = press("Go home", "home", self._blocked, arm=True)
+        force = wrench_text(self._console.latest(topics.WRENCH), self._force_limit) if available else ""
         self._arm.set(block('<div class="buttons">' + (
-            f"{span('Gripper', 'dim')}{self._gripper.buttons}" if self._gripper is not None else "") + home + "</div>",
-            "arm"))
+            f"{span('Gripper', 'dim')}{self._gripper.buttons}" if self._gripper is not None else "") + home + "</div>"
+            + (f"<div>{span('Force at the tool', 'dim')} {text(force)}</div>" if force else ""), "arm"))
         self._poses.show(self._blocked)
         self._discard_if_marker_moved()
 

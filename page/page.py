@@ -355,7 +355,7 @@ class Page:
         """Read only the on-demand topics that a page displays."""
         selected: list[Topic[Any]] = []
         if self.pages:
-            selected += self._controls.TOPICS if self._controls is not None else ()
+            selected += [topics.WRENCH, *(self._controls.TOPICS if self._controls is not None else ())]
             for name, kind in self._kinds.items():
                 selected += kind.TOPICS if self._shown[name] or (kind.EDITS and self._editing) else ()
             selected += self._hand_eye.needed_topics

@@ -22,6 +22,7 @@ from common.messages import (
     Rejections,
     RobotStatus,
     TaskStatus,
+    Wrench,
 )
 from page.application import ApplicationPage, page_of
 from page.markup import BAD, BUSY, GOOD, OFF
@@ -239,6 +240,15 @@ def gripper_text(state: GripperState | None) -> str:
 
 
 # --- errors and plans ---
+
+
+def wrench_text(wrench: Wrench | None, limit: float) -> str:
+    """Return the force at the tool in its axes and the hard limit [N] of force motions; empty without a sensor."""
+    if wrench is None or wrench.force is None:
+        return ""
+    x, y, z = wrench.force.x, wrench.force.y, wrench.force.z
+    return f"{math.hypot(x, y, z):.1f} N (x {x:.1f}, y {y:.1f}, z {z:.1f}), limit {limit:g} N" + (
+        "" if wrench.zeroed else ", not zeroed")
 
 
 def error_text(error: ZencellError | ValidationError) -> str:

@@ -109,7 +109,7 @@ class Inserting(Handling):
         hole, expected = self.p.hole, None if view.holding else held
         length = float(np.linalg.norm(tool[:3, 3] - end))
         insert = Insert(
-            "insert", "PLACING", cycle, force=hole.force, frame="world",
+            "insert", "PLACING", cycle, force=hole.force, frame="world", zero=True,
             max_distance=hole.clearance + hole.depth + FARTHER, carries=True, attach=thing.id, attach_pose=expected,
             touches=[(thing.id, name) for name in hole.around],
             fields={"depth": hole.depth, "tip": length, "surface": hole.clearance, "radius": hole.radius,

@@ -48,7 +48,8 @@ class ForceArm:
             max_distance: [m]; without contact until there the motion fails with code `no_contact`.
             speed: [m/s].
             touch: what may be touched.
-            more: other fields of a `ForceMotion`: force_limit [N], torque_limit [N m], timeout [s].
+            more: other fields of a `ForceMotion`: force_limit [N], torque_limit [N m], timeout [s], zero (first
+                takes the wrench at rest as zero).
 
         Raises:
             ConfigError, UnknownName: invalid values.

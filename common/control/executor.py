@@ -23,7 +23,6 @@ from common.control.status import ChangeDetector, Report, joint_state
 from common.control.trajectory import Tolerances, Trajectory
 from common.control.trajectory_controller import PERIOD, TrajectoryController
 from common.control.vendor_controller import VendorController
-from common.control.wrench import Wrenches
 from common.errors import ConfigError, Refused
 from common.hardware.interface import (
     Hardware,
@@ -142,7 +141,7 @@ class Executor:
         self.force.update(now, self._q, dq, held, self.arm.at_rest)
         if self.vendor.update(held, self._speed_scaling):
             self.arm.jog(self.authority.jog_velocity(self._speed_scaling), self.vendor.slider)
-            if gone := self.force_motions.sense(self.arm, self._q, Wrenches.of(self.force.estimator)):
+            if gone := self.force_motions.sense(self.arm, self._q, self.force):
                 self.arm.abort("requester_gone", gone)
             set_points = self.arm.update(now, self._q, dq)
             if set_points is not None:

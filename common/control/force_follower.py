@@ -30,6 +30,7 @@ POSTURE_GAIN = 2.0  # [1/s] with which redundant joints return to the planned pa
 DAMPING = 0.01  # of the pseudo-inverse, near singular poses
 BACK_OFF, BACK_OFF_SPEED = 5e-3, 0.01  # [m], [m/s] after the hard limit was exceeded
 RELIEVED = 0.3  # share of the limit at which the arm stops to back off
+ZERO_TIMEOUT = 2.0  # [s] for an arm to be at rest for so long that its wrench can be zeroed
 CYCLE_SHARE = 0.9  # of a cycle in which the arm must be able to brake
 
 
@@ -39,6 +40,7 @@ class ForceFollower:
     Attributes:
         line: planned positions (SAMPLES, dof) [rad] at equal distances.
         end: how the motion ends, from when it is known; the arm comes to rest first.
+        zeroing: whether the arm stays at rest until the wrench is zeroed.
     """
 
     def __init__(
@@ -69,6 +71,7 @@ class ForceFollower:
         self._offset = np.zeros(6)  # as the law asks for
         self._time = 0.0  # in motion [s]
         self.end: Outcome | None = None
+        self.zeroing, self._waited = request.zero, 0.0  # [s] for it
         self._wrench: Wrenches | None = None
         self._last: Sample | None = None  # by which the end was decided
         self._backing = False
@@ -130,11 +133,16 @@ class ForceFollower:
         """
         if self.end is None and not goal.stopping:
             self._check_limits()
+        if self.zeroing and self.end is None:
+            self._waited += 0.0 if held else elapsed
+            if self._waited > ZERO_TIMEOUT:
+                self.end = Outcome("aborted", "not_zeroed", f"the arm was not at rest for long enough within "
+                                                            f"{ZERO_TIMEOUT:g} s to zero the wrench")
         ending = goal.stopping or held or (self.end is not None and not self._backing)
-        if ending:
+        if ending or self.zeroing:
             found = limiter.brake(elapsed)
             self._offset = self._offset_of(found[0])
-            if limiter.at_rest and not held:
+            if limiter.at_rest and ending and not held:
                 self._at_rest(goal, now)
         else:
             found = self._advance(limiter, elapsed, share)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import NamedTuple
 
 from common.control.force_follower import ForceFollower
+from common.control.force_sensing import ForceSensing
 from common.control.jogging import ToolKinematics
 from common.control.trajectory import Trajectory
 from common.control.trajectory_controller import TrajectoryController
@@ -70,11 +72,15 @@ class ForceRequests:
         if request.id == goal:
             self._by_task, self._seen = not request.owner, monotonic()
 
-    def sense(self, arm: TrajectoryController, q: Vector, wrench: Wrenches | None) -> str:
+    def sense(self, arm: TrajectoryController, q: Vector, sensing: ForceSensing) -> str:
         """Give the reading of a cycle to a force motion; return why its requester is gone, or ""."""
         if (motion := arm.force) is None:
             return ""
-        motion.sense(q, wrench)
+        if motion.zeroing and motion.end is None:
+            with contextlib.suppress(Refused):  # not at rest for long enough yet
+                sensing.zero()
+                motion.zeroing = False
+        motion.sense(q, Wrenches.of(sensing.estimator))
         if self._by_task:
             return "" if self.task_present else "the task that requested it is gone"
         late = monotonic() - self._seen > KEEP_ALIVE

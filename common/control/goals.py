@@ -35,9 +35,11 @@ class ForceControl(Protocol):
 
     Attributes:
         end: how the motion ends, from when it is known; the arm comes to rest first.
+        zeroing: whether the arm stays at rest until the wrench is zeroed.
     """
 
     end: Outcome | None
+    zeroing: bool
 
     @property
     def result(self) -> tuple[float, float]:

@@ -34,6 +34,8 @@ class ForceMotion(ExecuteRequest):
         None, description="hard limit [N]; lowers robot.force_limit, and never raises it")
     torque_limit: Annotated[float, Field(gt=0, le=1000)] | None = Field(
         None, description="hard limit at the TCP [N m]; lowers robot.torque_limit, and never raises it")
+    zero: bool = Field(
+        False, description="first take the wrench at rest as zero: nothing must touch the tool")
     timeout: Annotated[float, Field(gt=0, le=600)] = Field(30.0, description="cell time, holds not counted [s]")
     radius: Annotated[float, Field(ge=0, le=0.01)] = Field(
         0.003, description="comply: largest distance from the line; insert: of the spiral [m]")

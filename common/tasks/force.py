@@ -35,6 +35,7 @@ class ForceMove(Move):
     frame: JogFrame = field(default="base", kw_only=True)
     max_distance: float = field(default=0.05, kw_only=True)  # [m]
     force: float = field(default=5.0, kw_only=True)  # [N]
+    zero: bool = field(default=False, kw_only=True)  # first take the wrench at rest as zero: nothing touches the tool
     fields: dict[str, Any] = field(default_factory=dict, kw_only=True)  # others of a ForceMotion
 
     def __post_init__(self) -> None:
@@ -55,7 +56,8 @@ class ForceMove(Move):
         return check(m.ForceMotion, {
             "id": name, "kind": self.kind, "trajectory": trajectory or self.trajectory, "plan": self.plan,
             "scene_stamp": self.scene_stamp, "direction": dict(zip("xyz", self.direction, strict=True)),
-            "frame": self.frame, "max_distance": self.max_distance, "force": self.force, **self.fields}, self.name)
+            "frame": self.frame, "max_distance": self.max_distance, "force": self.force, "zero": self.zero,
+            **self.fields}, self.name)
 
     def end(self) -> list[float]:
         """Return nothing: only the force decides where it ends."""

@@ -8,8 +8,17 @@ from unittest.mock import MagicMock
 import pytest
 import viser
 
+from common import topics
 from common.client.operator_motion import MotionFailed
-from common.messages import Interlock, JointTrajectory, JointTrajectoryPoint, MotionStatus, PlanResponse
+from common.messages import (
+    Interlock,
+    JointTrajectory,
+    JointTrajectoryPoint,
+    MotionStatus,
+    PlanResponse,
+    Vector3,
+    Wrench,
+)
 from common.saved_poses import SavedPoses, poses_file, save_poses
 from page.console import ActionQueue
 from page.move_panel import MovePanel
@@ -85,3 +94,14 @@ async def test_stop_between_two_poses_ends_the_sequence(move: Panel) -> None:
     await move.panel._poses._run_sequence()
     assert move.motions.moves == 1
     assert move.notes[-2:] == [("Moving to two …", "busy"), ("the motion was rejected", "bad")]
+
+
+async def test_force_at_the_tool_is_shown_with_its_limit(move: Panel) -> None:
+    pushed = Wrench(force=Vector3(z=-4.0), zeroed=True)
+    move.panel._console.latest = lambda topic: pushed if topic is topics.WRENCH else None
+    move.panel._console.is_available = lambda _request: True
+    move.panel.show(None, 0.0)
+    assert "Force at the tool" in move.panel._arm.content and "4.0 N" in move.panel._arm.content
+    move.panel._console.latest = lambda _topic: None
+    move.panel.show(None, 0.3)
+    assert "Force at the tool" not in move.panel._arm.content

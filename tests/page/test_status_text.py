@@ -47,6 +47,13 @@ def test_texts_of_arm_and_gripper() -> None:
     assert texts.gripper_text(m.GripperState(width=0.0)) == "gripper closed"
 
 
+def test_force_at_the_tool_is_a_line_only_where_a_sensor_reports_it() -> None:
+    assert texts.wrench_text(None, 60.0) == texts.wrench_text(m.Wrench(reason="no sensor"), 60.0) == ""
+    pushed = m.Wrench(force=m.Vector3(x=3.0, y=0.0, z=-4.0), zeroed=True)
+    assert texts.wrench_text(pushed, 60.0) == "5.0 N (x 3.0, y 0.0, z -4.0), limit 60 N"
+    assert texts.wrench_text(pushed.model_copy(update={"zeroed": False}), 60.0).endswith(", not zeroed")
+
+
 def test_text_of_a_plan_has_planner_and_duration_or_the_colliding_objects_once() -> None:
     points = [m.JointTrajectoryPoint(time_from_start=t, positions=[0.0], velocities=[0.0], accelerations=[0.0])
               for t in (0.0, 2.5)]

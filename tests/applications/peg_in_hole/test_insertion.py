@@ -26,9 +26,11 @@ def test_peg_that_the_camera_sees_is_inserted_a_millimetre_and_a_degree_off() ->
 
     async def visit(bus: Bus) -> None:
         truth, motions = bus.reader(topics.SCENE_OBJECTS), bus.reader(topics.MOTION_STATUS)
+        wrench = bus.reader(topics.WRENCH)
         async for status in bus.reader(INSERTION_STATUS):
             if motions.latest is not None and motions.latest.message.startswith("inserted"):
                 forces.append(motions.latest.message)
+                assert wrench.latest is not None and wrench.latest.zeroed, "by the stage itself"
             if status.state in ("DONE", "ERROR"):
                 assert truth.latest is not None
                 at = truth.latest.objects[0].pose.position

@@ -217,3 +217,31 @@ def test_scene_monitor_reads_the_planned_line_of_a_force_motion() -> None:
     assert type(followed) is m.ExecuteRequest and followed.trajectory == request.trajectory
     rig.run(2.0)
     assert 0.3 < rig.status.progress < 0.9
+
+
+def test_motion_that_zeroes_first_moves_only_after_rest_and_by_the_force_since() -> None:
+    rig = WallRig(wall=0.01)
+    rig.arm.extra = np.array([0.0, 0.0, 6.0])  # an offset of the sensor: more than the requested force
+    top = rig.height
+    rig.send(force=5.0, zero=True)
+    rig.run(0.1)
+    assert rig.height == top and rig.executor.arm.goal, "at rest until the mean is known"
+    assert (rig.finish().state, rig.executor.force.estimator.zeroed) == ("succeeded", True)
+    assert rig.status.distance == pytest.approx(0.01 + 5.0 / 2e4, abs=4e-4)
+
+
+@pytest.mark.parametrize("cause", ["moving", "pressing", "stopped"])
+def test_motion_that_cannot_zero_ends_where_it_is(cause: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = WallRig()
+    q = rig.arm.q.copy()
+    if cause == "moving":
+        monkeypatch.setattr(rig.arm, "read", lambda now: (rig.arm.q.copy(), np.full(7, 0.03)))
+    elif cause == "pressing":
+        rig.arm.extra = np.array([0.0, 0.0, 61.0])
+    rig.send(force=5.0, zero=True)
+    rig.run(0.05)
+    if cause == "stopped":
+        rig.executor.authority.stop(m.StopRequest(reason="stop", owner="anna"), rig.now)
+    expected = {"moving": "not_zeroed", "pressing": "force_limit", "stopped": "cancelled"}[cause]
+    assert rig.finish(10.0).error == expected and not rig.executor.force.estimator.zeroed
+    assert np.array_equal(rig.arm.q, q)
