@@ -29,6 +29,7 @@ OFF, TILT = 1e-3, math.radians(1.0)
 DEPTH, CLEARANCE = 0.015, 0.01  # [m] to insert, and above the block at the start
 DEEP_ENOUGH = 0.0145  # [m] by the truth
 STILL = 1e-3  # [m/s] of the TCP
+PROMISED = 0.02  # [s] from the crossing of the force, after which the tool should not move
 
 
 def contact(seed: int, speed: float | None = None) -> dict[str, Any]:
@@ -60,7 +61,8 @@ def contact(seed: int, speed: float | None = None) -> dict[str, Any]:
         "speed": round(speed, 5), "force": round(force, 2),
         "set_points_ms": round(1e3 * (last - at), 1), "standstill_ms": round(1e3 * float(times[fast[-1] + 1] - at), 1),
         "over_n": round(float(forces[crossed:].max()) - force, 2), "rest_n": round(float(forces[-1]), 2),
-        "over_mm": round(1e3 * float(heights[crossed] - heights[crossed:].min()), 4)}
+        "over_mm": round(1e3 * float(heights[crossed] - heights[crossed:].min()), 4),
+        "late_mm": round(1e3 * float(np.ptp(heights[times > at + PROMISED])), 4)}
 
 
 def insertion(seed: int) -> dict[str, Any]:
@@ -96,7 +98,7 @@ def report(rows: Sequence[dict[str, Any]]) -> None:
     """Print medians, largest values, and shares with their intervals."""
     for kind, good, values in (
         ("contact", lambda row: row["state"] == "succeeded" and row["over_n"] >= 0.0,
-         ("set_points_ms", "standstill_ms", "over_n", "over_mm", "rest_n")),
+         ("set_points_ms", "standstill_ms", "late_mm", "over_n", "over_mm", "rest_n")),
         ("insertion", lambda row: row["inserted"],
          ("seconds", "depth_mm", "start_off_mm", "most_n", "penetration_mm", "usual_penetration_mm")),
     ):

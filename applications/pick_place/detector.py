@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from applications.pick_place.ball_places import BallGeometry, is_table, shows_table
+from applications.pick_place.ball_places import BallGeometry, shows_table
+from applications.pick_place.container_floor import ContainerFloor
 from applications.pick_place.depth_spheres import find_balls_in_depth
 from applications.pick_place.outliers import (
     BELOW,
@@ -27,7 +28,6 @@ from applications.pick_place.outliers import (
     THIN,
     Outlier,
     covered,
-    oval,
     sized,
     unlike,
 )
@@ -39,34 +39,27 @@ from applications.pick_place.segmentation import (
     Outline,
     OutlineKey,
     RedMasks,
-    all_of,
     blob_centers,
     find_blobs,
     long_components,
     small_blobs,
 )
-from applications.pick_place.sphere_fit import Fit, fit_each, fit_spheres, separate
+from applications.pick_place.single_fits import ROUND, SingleFits
+from applications.pick_place.sphere_fit import Fit, fit_spheres, separate
 from common.config import CameraConfig, Parameters, Surroundings, Tunable
 from common.perception.depth import Depth
-from common.perception.illumination import BoolMask, blank_image_reason, blue_share, sampled_pixels
+from common.perception.illumination import BoolMask, blank_image_reason, sampled_pixels
 from common.perception.labels import draw_labels
 from common.perception.pinhole import Pinhole, ray_distances, silhouettes
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 
-_ROUND = 0.96  # fraction of an outline that must fit for a blob to be one ball
-_BRIGHT = 60  # [0..255] green from which its ratio to blue is reliable, also where red is clipped
-_WARMEST = 0.25  # blue relative to green that remains in light of 2700 K
-_LEAST_BLUE = 0.15  # the same in light in which balls still show some blue: at 2400 K there is less
-_LEAST_GREEN = 0.05  # of a ball's color; below this its blue cannot be judged
-_TURNS_RED = 0.25, 0.9  # green relative to red of a container that looks red where red is clipped
 _LEAST_TABLE = 0.1  # smallest fraction of the image that shows the table, to measure the color of the light
 
 Hue = Annotated[int, Field(ge=0, le=180)]
 Byte = Annotated[int, Field(ge=0, le=255)]
 Hsv = tuple[Hue, Byte, Byte]
-_Key = tuple[OutlineKey, tuple[float, float], float]  # of a blob: outline, center [px], expected offset [m]
 
 
 class DetectorOptions(Parameters):
@@ -122,15 +115,6 @@ class _Seen:
     border: Array  # (m, 2) pixels of its blob at the border of the image
 
 
-class _Round(NamedTuple):
-    """Fit of one sphere to a blob: center relative to the optical center [m], and its offset [m]."""
-
-    center: Array
-    offset: float
-    close: float  # fraction of the outline that fits
-    oval: float  # by which it is longer in one direction [m]
-
-
 class Detector:
     """Finds balls; the same image always gives the same detections."""
 
@@ -147,7 +131,7 @@ class Detector:
         self._table: tuple[Pinhole, BoolMask | None] | None = None  # where the last camera shows it
         self._masks = Masks()
         self._outlines: dict[OutlineKey, Outline] = {}  # of the last image, reused while a blob stays the same
-        self._fits: dict[_Key, list[_Round]] = {}
+        self._singles, self._floor = SingleFits(self.resting), ContainerFloor(surroundings, self.resting)
         self.blind = ""  # why the last image is unusable
         self.outliers: list[Outlier] = []  # red objects in the last image that are no balls on the table
         self.too_small = 0  # blobs of the last image below the minimum area, outside of the container
@@ -175,7 +159,9 @@ class Detector:
         last = self._last
         if last and masks.closed is last[0] and camera is last[1] and self.options == last[2]:
             return list(last[3])
-        found = [one for one in self._look_at(masks, camera) if not self._is_floor(one, picture, camera)]
+        table = None if self._table is None else self._table[1]
+        found = [one for one in self._look_at(masks, camera)
+                 if not self._floor.is_seen(one.pixel, one.outline, picture, camera, table)]
         self.blind = "" if found else blank_image_reason(picture)
         self._last = (masks.closed, camera, self.options.model_copy(), found)
         return list(found)
@@ -204,7 +190,7 @@ class Detector:
         fine, closed, narrow = masks
         if self._last is None or camera is not self._last[1]:
             self._outlines.clear()
-            self._fits.clear()
+            self._singles.clear()
         blobs = find_blobs(closed, fine, camera, self.options.min_contour_area_px, self._outlines)
         self._outlines = {blob.traced: blob.outline for blob in blobs}
         small = small_blobs(closed, self.options.min_contour_area_px)
@@ -257,12 +243,12 @@ class Detector:
 
         A round blob larger than any ball can look there is ignored: it is something else, or falling.
         """
-        tried, crowded = self._fit_singles(blobs, camera, offset, pixel_size)
+        tried, crowded = self._singles.fit(blobs, camera, offset, pixel_size)
         alone: list[_Seen] = []
         offsets: list[float] = []
         sizes: list[float] = []
         for blob, tries in tried:
-            if min(one.close for one in tries) < _ROUND:
+            if min(one.close for one in tries) < ROUND:
                 crowded.append(blob)
                 continue
             there = self._pixel_size(camera, blob.centroid)
@@ -285,40 +271,6 @@ class Detector:
                 self.outliers.append(self._outlier(pixel, camera, sized(offsets[k] * sizes[k], usual * sizes[k])))
                 del alone[k], offsets[k]
         return alone, crowded, offsets
-
-    def _fit_singles(
-        self, blobs: list[Blob], camera: Pinhole, offset: float, pixel_size: float
-    ) -> tuple[list[tuple[Blob, list[_Round]]], list[Blob]]:
-        """Fit one sphere at each possible height to every complete blob; return these, and the other blobs."""
-        crowded: list[Blob] = []
-        tried: list[tuple[Blob, _Key]] = []
-        starts: dict[_Key, list[Array]] = {}  # of blobs that were not in the last image
-        fits: dict[_Key, list[_Round]] = {}
-        for blob in blobs:
-            center = camera.on_plane(blob.centroid, self.resting.plane)
-            if len(blob.border) or len(blob.outline) < 12 or not np.isfinite(center).all():
-                crowded.append(blob)
-                continue
-            key = blob.traced, (float(blob.centroid[0]), float(blob.centroid[1])), offset
-            if key in self._fits:
-                fits[key] = self._fits[key]
-            else:
-                ray = np.append(center, self.resting.plane) - camera.position
-                heights = self.resting.heights(camera, blob.centroid)
-                starts[key], fits[key] = [ray * ((z - camera.position[2]) / ray[2]) for z in heights], []
-            tried.append((blob, key))
-        fitted = [(blob.outline, key, start) for blob, key in tried for start in starts.get(key, ())]
-        if fitted:
-            found = fit_each(
-                *all_of([outline for outline, _, _ in fitted]), np.array([start for _, _, start in fitted]),
-                self.resting.radius, offset=offset, close=1.3 * pixel_size,
-                gates=(self.resting.radius, 4 * pixel_size, 3 * pixel_size),
-            )
-            for (outline, key, _), center, off, close in zip(fitted, *found, strict=True):
-                longer = oval(outline, center, camera) if close >= _ROUND else 0.0
-                fits[key].append(_Round(center, float(off), float(close), longer))
-        self._fits = fits
-        return [(blob, fits[key]) for blob, key in tried if fits[key]], crowded
 
     def _is_explained(self, blob: Blob, owner: npt.NDArray[np.intp], camera: Pinhole) -> bool:
         """Return whether the balls explain the outline of their blob; blobs in the container are exempt."""
@@ -348,40 +300,6 @@ class Detector:
         if offsets[upper] - usual <= MOST_UNLIKE * pixel_size:
             return []
         return [sized(float(offsets[k]), usual) if k == upper else BELOW for k in range(len(offsets))]
-
-    def _is_floor(self, seen: Detection, picture: Picture, camera: Pinhole) -> bool:
-        """Return whether a detection in the container is its floor: an overexposed orange floor is red in warm light.
-
-        Green and blue are not clipped then: balls have more blue than the floor, in any light with some blue.
-        """
-        least = self._blue_of_balls
-        if least is None or not self.resting.shows_container(camera, seen.pixel):
-            return False
-        inner = np.concatenate([seen.pixel + part * (seen.outline - seen.pixel) for part in (0.3, 0.6)])
-        u, v = np.clip(np.rint(inner).astype(int), 0, (camera.width - 1, camera.height - 1)).T
-        blue, green = picture[v, u, :2].astype(float).T
-        bright = green >= _BRIGHT
-        return bool(bright.mean() > 0.5 and np.median(blue[bright] / green[bright]) < least
-                    and self._blue_of_light(picture) >= _LEAST_BLUE)
-
-    def _blue_of_light(self, picture: Picture) -> float:
-        """Blue of the light relative to its green, measured on the table: 1 in daylight, 0 when unknown."""
-        table = next((fixture for fixture in self._around.fixtures
-                      if is_table(fixture, self._around.table_height)), None)
-        if table is None or self._table is None or self._table[1] is None or min(table.color[1:]) <= 0:
-            return 0.0
-        return blue_share(picture, self._table[1]) * table.color[1] / table.color[2]
-
-    @property
-    def _blue_of_balls(self) -> float | None:
-        """Smallest blue relative to green that balls show in warm light.
-
-        None if the container never looks like a ball: it is neither orange nor brown, or has as much blue.
-        """
-        red, green, blue = self.resting.container.color
-        _, green_of_ball, blue_of_ball = self._around.ball_color
-        least = 0.5 * _WARMEST * min(1.0, blue_of_ball / max(green_of_ball, _LEAST_GREEN))
-        return least if _TURNS_RED[0] <= green / max(red, 1e-3) <= _TURNS_RED[1] and blue <= least * green else None
 
     def _thin(self, narrow: Mask, camera: Pinhole) -> list[Outlier]:
         """Return long, thin red objects."""
