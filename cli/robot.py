@@ -179,10 +179,11 @@ def jog(
     at: CellTarget = OF_ARM,
 ) -> None:
     """Jog the arm for a while: at most 0.25 m/s; the arm is at standstill 0.2 s after Ctrl-C or the end."""
-    from common.client.operator_motion import check_seconds
+    from common.client.arguments import require_seconds
+    from common.client.operator_motion import LONGEST_JOG
 
     duration = options.number("--seconds", seconds)
-    check_seconds(duration, "--seconds")
+    require_seconds("--seconds", duration, LONGEST_JOG)
     if not (joint or linear or angular):
         raise ConfigError("jog", ..., "needs --joint NAME=V, --linear X,Y,Z or --angular X,Y,Z")
     joints = {}

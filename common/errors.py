@@ -37,7 +37,7 @@ class UnknownName(ZencellError):
 
     def __init__(self, what: str, name: str, choices: Iterable[str]) -> None:
         listed = sorted(choices)
-        near = get_close_matches(name, listed, n=1)
+        near = get_close_matches(str(name), listed, n=1)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
         super().__init__(f"unknown {what} {name!r}{hint}; choices: {', '.join(listed) or 'none'}")
         self.what = what

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common import topics
+from common.client.arguments import given, listed, require_seconds
 from common.client.force import ForceArm
 from common.client.goals import GoalLike, Plan, Point, WaypointPath, goal_of, numbers
-from common.client.operator_motion import PROGRESS_TIMEOUT, Jogging, MotionFailed, OperatorMotion, check_seconds
-from common.client.subscriptions import NothingReceived, Part, Subscriptions
-from common.client.wrench import WrenchArm
+from common.client.operator_motion import LONGEST_JOG, PROGRESS_TIMEOUT, Jogging, MotionFailed, OperatorMotion
+from common.client.subscriptions import Part, Subscriptions
 from common.config import check
 from common.errors import ConfigError, RequestLost, RequestTimeout, UnknownName
 from common.messages import (
@@ -24,13 +24,11 @@ from common.messages import (
     GripperState,
     HoldRequest,
     JogCommand,
-    JointState,
     MotionOwner,
     MotionStatus,
     OwnRequest,
     PathConstraints,
     RobotCommand,
-    RobotDescription,
     RobotStatus,
     StopRequest,
 )
@@ -44,14 +42,12 @@ STANDSTILL_TIMEOUT, STANDSTILL = 1.0, 1e-3  # [s] wall until a jogged arm is at 
 ARC_PLANNER = "circ"  # plans arcs; it need not be in the pipeline of a cell
 
 
-class Arm(ForceArm, WrenchArm):
+class Arm(ForceArm):
     """The arm. Lengths in metres, angles in radians; poses are (4, 4), of the tool centre point in world.
 
     Nothing moves while a task or another client has the robot; the operator can always move what they stopped or hold
     themselves. A cancelled motion, also by Ctrl-C, is stopped.
     """
-
-    owner: str  # client name in its requests
 
     def __init__(
         self, subscriptions: Subscriptions, owner: str, tf: Callable[[str, str], Coroutine[Any, Any, Array]]
@@ -62,42 +58,6 @@ class Arm(ForceArm, WrenchArm):
         self._subscriptions, self._bus, self._tf = subscriptions, subscriptions.bus, tf
         self._moving: set[asyncio.Task[Any]] = set()  # tasks of this program that move it
         self._owning, self._lease = 0, 0.0  # nested `owned` blocks, and their lease [s]
-
-    # --- state ----------------------------------------------------------------------------------------------------
-
-    async def description(self) -> RobotDescription:
-        """Return the names of its joints, limits, named poses, and the frame of its tool."""
-        return await self._subscriptions.latest(topics.ROBOT_DESCRIPTION)
-
-    async def joints(self) -> Array:
-        """Return its positions (dof,) [rad or m], in the order of `description().joints`."""
-        return (await self._measured())[0]
-
-    async def velocities(self) -> Array:
-        """Return its velocities (dof,) [rad/s or m/s]."""
-        return (await self._measured())[1]
-
-    async def _measured(self) -> tuple[Array, Array]:
-        names = (await self.description()).joints
-        state: JointState = await self._subscriptions.next(topics.JOINT_STATES)
-        q = dict(zip(state.name, state.position, strict=True))
-        dq = dict(zip(state.name, state.velocity or [0.0] * len(state.name), strict=True))
-        missing = [name for name in names if name not in q]
-        if missing:
-            raise NothingReceived(f"{self._bus.cell}/joint_states of {', '.join(missing)}")
-        return np.array([q[name] for name in names]), np.array([dq[name] for name in names])
-
-    async def pose(self, frame: str = "world") -> Array:
-        """Return the pose (4, 4) of the tool centre point in a frame."""
-        return await self._tf(frame, (await self.description()).tcp)
-
-    async def status(self) -> MotionStatus:
-        """Return its goal, its progress, and the operator who stopped or holds it."""
-        return await self._subscriptions.query(topics.MOTION_STATUS)
-
-    async def robot(self) -> RobotStatus:
-        """Return the state of its own controller: mode, why it cannot move, speed slider, inputs and outputs."""
-        return await self._subscriptions.query(topics.ROBOT_STATUS)
 
     # --- motion ---------------------------------------------------------------------------------------------------
 
@@ -130,13 +90,13 @@ class Arm(ForceArm, WrenchArm):
         if isinstance(to, WaypointPath):
             to = to.starting_at(await self.pose())
         goal = goal_of(to, via=via, around=around)
-        if names := [touch] if isinstance(touch, str) else list(touch):
+        if names := listed("touch", touch):
             await self._require_objects(names)
             pairs = [(link, name) for link in (await self.description()).fingers for name in names]
-            more["allowed_collisions"] = [*more.get("allowed_collisions", ()), *pairs]
+            more["allowed_collisions"] = [*listed("allowed_collisions", more.get("allowed_collisions", ())), *pairs]
         planner = planner or (ARC_PLANNER if isinstance(goal, ArcGoal) else "")
-        response = await self._motion.plan(goal, **_merged(
-            more, straight=straight, velocity_scaling=speed, planner=planner, constraints=constraints))
+        response = await self._motion.plan(goal, **given({
+            "straight": straight, "velocity_scaling": speed, "planner": planner, "constraints": constraints}, more))
         if not response.ok or response.trajectory is None:
             raise MotionFailed(response.error, response.message)
         return Plan.of(response)
@@ -239,9 +199,9 @@ class Arm(ForceArm, WrenchArm):
             JogFailed: motion authority was not obtained, or was lost.
             RequestFailed: the state of the robot is unknown.
         """
-        check_seconds(seconds)
+        require_seconds("seconds", seconds, LONGEST_JOG)
         command = check(JogCommand, {
-            "owner": self.owner, "joints": dict(joints or {}), "frame": frame,
+            "owner": self.owner, "joints": {} if joints is None else joints, "frame": frame,
             "linear": dict(zip("xyz", numbers("linear", linear).tolist(), strict=True)),
             "angular": dict(zip("xyz", numbers("angular", angular).tolist(), strict=True))}, "jog")
         known = (await self._subscriptions.latest(topics.JOINT_STATES)).name
@@ -304,16 +264,9 @@ class Arm(ForceArm, WrenchArm):
 
     async def order(self, act: str, value: float = 0.0, **more: Any) -> RobotStatus:
         """Send a command to the arm's own controller: enable, recover, freedrive (1 or 0), payload [kg] or output."""
-        command = check(RobotCommand, {
-            "header": self._bus.header(), "act": act, "value": value, "owner": self.owner, **more}, act)
+        command = check(RobotCommand, given({
+            "header": self._bus.header(), "act": act, "value": value, "owner": self.owner}, more), "order")
         return await self._bus.client(topics.ROBOT_COMMAND).call(command, POWER_TIMEOUT)
-
-
-def _merged(more: dict[str, Any], **given: Any) -> dict[str, Any]:
-    """Return the fields of a plan request, and refuse those that are given twice."""
-    for name in {"goal", *given} & more.keys():
-        raise ConfigError(name, more[name], "is given twice")
-    return {**{name: value for name, value in given.items() if value is not None}, **more}
 
 
 MOVE_TIMEOUT = 10.0  # [s] wall for a motion of the fingers
@@ -351,6 +304,7 @@ class Gripper(Part):
             MotionFailed: another client has motion authority, the command was rejected, or timed out.
             RequestFailed: the executor does not answer.
         """
+        require_seconds("timeout", timeout)
         if not (await self._arm.description()).gripper:
             raise MotionFailed("no_gripper", "the robot of this cell has no gripper")
         acknowledged = (await self._arm.require_free()).newest
@@ -387,4 +341,4 @@ class Gripper(Part):
 
     async def close(self, force: float = 0.0, **more: Any) -> GripperState:
         """Close until the fingers touch each other or an object; `holding` of the result is true for an object."""
-        return await self.move(0.0, force, **more)
+        return await self.move(**given({"width": 0.0, "force": force}, more, own=()))

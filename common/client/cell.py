@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 from collections.abc import AsyncGenerator, AsyncIterator, Mapping, Sequence
 from typing import Any
 
@@ -14,8 +13,10 @@ from numpy.typing import NDArray
 
 from common import topics
 from common.application import all_topics, find_topic
+from common.client.arguments import require_seconds, require_text
 from common.client.arm import Arm, Gripper
 from common.client.frames import Frames
+from common.client.goals import number
 from common.client.io import Signals
 from common.client.joining import StartedCell, cell_clock, domain_of_only, joined, operator_name, supervisor_status
 from common.client.keys import published_keys, require_key
@@ -243,6 +244,8 @@ class Cell(Part):
         Raises:
             NothingReceived: there are fewer.
         """
+        number("least", least)
+        require_seconds("timeout", timeout)
         reader = self._subscriptions.reader(topics.PLANNING_SCENE)
         found = perceived(await self.planning_scene())
         try:
@@ -303,8 +306,7 @@ class Cell(Part):
         request = await self._topic(key)
         if not isinstance(request, Request):
             raise UnknownName("request", str(key), [n for n, each in all_topics().items() if isinstance(each, Request)])
-        if not math.isfinite(timeout) or timeout <= 0:
-            raise ConfigError("timeout", timeout, "must be more than 0")
+        require_seconds("timeout", timeout)
         if not isinstance(message, Message | Mapping | None):
             raise ConfigError(request.key, message, f"must be a {request.message.__name__}, or its fields")
         checked = message if isinstance(message, Message) else check(
@@ -330,7 +332,10 @@ class Cell(Part):
             NothingReceived: no message arrived in time.
         """
         topic = None if plain else await self._topic(key)
+        if timeout is not None:
+            require_seconds("timeout", timeout)
         if plain:
+            require_text("key", key)
             require_key(str(key))
         if topic is None and not plain:
             raise UnknownName("key", str(key), published_keys())

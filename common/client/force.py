@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from common import topics
+from common.client.arguments import given, listed
+from common.client.arm_state import ArmState
+from common.client.goals import number, numbers
 from common.client.operator_motion import PROGRESS_TIMEOUT, MotionFailed, OperatorMotion
-from common.client.subscriptions import Subscriptions
 from common.config import check
 from common.errors import ConfigError, UnknownName
-from common.messages import ForceMotion, JointTrajectory, MotionStatus, PoseGoal, RobotDescription
+from common.messages import ExecuteRequest, ForceMotion, JointTrajectory, MotionStatus, PoseGoal
 from common.robot.transforms import matrix_to_pose
 from common.tasks.force import OVERSHOOT
 
-Array = NDArray[np.float64]
 Direction = tuple[float, float, float]
 Frame = Literal["tool", "world"]
 
 DOWN = (0.0, 0.0, -1.0)
 
 
-class ForceArm:
+class ForceArm(ArmState):
     """The force motions of an arm. Each plans its straight line first and is refused where anything obstructs it.
 
     `touch` names what may be touched: ids of the planning scene, by the fingers and by what they hold. The robot file
@@ -33,7 +33,6 @@ class ForceArm:
     """
 
     _motion: OperatorMotion
-    _subscriptions: Subscriptions
 
     async def move_until(
         self, force: float, *, direction: Direction = DOWN, frame: Frame = "world", max_distance: float = 0.05,
@@ -57,8 +56,7 @@ class ForceArm:
             RequestFailed: planner or executor do not answer.
         """
         return await self._by_force(
-            "until", touch, force=force, direction=direction, frame=frame, max_distance=max_distance, speed=speed,
-            **more)
+            "until", touch, direction, more, force=force, frame=frame, max_distance=max_distance, speed=speed)
 
     async def comply(
         self, timeout: float, *, force: float = 0.0, direction: Direction = DOWN, frame: Frame = "world",
@@ -79,8 +77,7 @@ class ForceArm:
             As `move_until`.
         """
         return await self._by_force(
-            "comply", touch, timeout=timeout, force=force, direction=direction, frame=frame, max_distance=max_distance,
-            **more)
+            "comply", touch, direction, more, timeout=timeout, force=force, frame=frame, max_distance=max_distance)
 
     async def insert(
         self, depth: float, *, force: float = 12.0, direction: Direction = DOWN, frame: Frame = "world",
@@ -100,45 +97,42 @@ class ForceArm:
         Raises:
             As `move_until`.
         """
+        if max_distance is None:
+            # Within the bounds of its field, so that an error names the depth.
+            max_distance = float(np.clip(number("depth", depth) + 0.02, 0.02, 0.3))
         return await self._by_force(
-            "insert", touch, depth=depth, force=force, direction=direction, frame=frame,
-            max_distance=depth + 0.02 if max_distance is None else max_distance, **more)
+            "insert", touch, direction, more, depth=depth, force=force, frame=frame, max_distance=max_distance)
 
-    async def description(self) -> RobotDescription:
-        """Return the description of the arm."""
-        raise NotImplementedError
-
-    async def pose(self, frame: str = "world") -> Array:
-        """Return the pose (4, 4) of the tool centre point in a frame."""
-        raise NotImplementedError
-
-    async def _by_force(self, kind: str, touch: Iterable[str], **fields: Any) -> MotionStatus:
+    async def _by_force(
+        self, kind: str, touch: Iterable[str], direction: Direction, more: Mapping[str, Any], **fields: Any
+    ) -> MotionStatus:
         """Plan the line, send the request, and repeat it until the motion has ended."""
-        d = np.asarray(fields["direction"], dtype=float)
-        if d.shape != (3,) or not np.isfinite(d).all() or not np.linalg.norm(d) > 0.0:
-            raise ConfigError("direction", fields["direction"], "must be three numbers that are not all 0")
+        d = numbers("direction", direction)
+        if not np.linalg.norm(d) > 0.0:
+            raise ConfigError("direction", direction, "must not be 0")
         d = d / np.linalg.norm(d)
-        fields = {"kind": kind, **fields, "direction": dict(zip("xyz", d.tolist(), strict=True))}
+        names = listed("touch", touch)
+        fields = given({"kind": kind, "direction": dict(zip("xyz", d.tolist(), strict=True)), **fields}, more,
+                       own=ExecuteRequest.model_fields)
         nothing = JointTrajectory(joint_names=["none"], points=[])
         checked = check(ForceMotion, {"id": kind, "trajectory": nothing, **fields}, kind)
         before = await self._motion.require_free()
         T = await self.pose()
         T[:3, 3] += (d if checked.frame != "tool" else T[:3, :3] @ d) * (checked.max_distance + OVERSHOOT)
         response = await self._motion.plan(
-            PoseGoal(pose=matrix_to_pose(T)), straight=True, allowed_collisions=await self._touching(touch))
+            PoseGoal(pose=matrix_to_pose(T)), straight=True, allowed_collisions=await self._touching(names))
         if not response.ok or response.trajectory is None:
             raise MotionFailed(response.error, response.message)
         return await self._motion.follow(
             response.trajectory, plan=response, acknowledged=before.newest, force=fields,
             timeout=checked.timeout + PROGRESS_TIMEOUT)
 
-    async def _touching(self, touch: Iterable[str]) -> list[tuple[str, str]]:
+    async def _touching(self, names: list[str]) -> list[tuple[str, str]]:
         """Return the pairs that may touch.
 
         Raises:
             UnknownName: a name is not in the planning scene.
         """
-        names = [touch] if isinstance(touch, str) else list(touch)
         scene = await self._subscriptions.query(topics.PLANNING_SCENE)
         known = [each.id for each in scene.objects]
         for name in names:

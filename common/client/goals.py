@@ -149,6 +149,18 @@ def numbers(name: str, given: object) -> Array:
     return values
 
 
+def number(name: str, given: object) -> float:
+    """Return one finite number.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    value = array_of(name, given)
+    if value.shape:
+        raise ConfigError(name, given, "must be one number")
+    return float(value)
+
+
 def _vector(name: str, given: Point) -> Vector3:
     x, y, z = numbers(name, given)
     return check(Vector3, {"x": x, "y": y, "z": z}, name)

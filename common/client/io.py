@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 from collections.abc import AsyncGenerator
 
 from common import topics
+from common.client.arguments import require_seconds
 from common.client.joining import newest_interlock
 from common.client.subscriptions import NothingReceived, Part, Subscriptions
 from common.config import Io, check
@@ -98,8 +98,7 @@ class Signals(Part):
             ConfigError: a value does not fit the signal.
             SignalTimeout: it does not have the value in time.
         """
-        if not math.isfinite(timeout) or timeout <= 0:
-            raise ConfigError("timeout", timeout, "must be more than 0")
+        require_seconds("timeout", timeout)
         reader = self._subscriptions.reader(topics.IO_STATE)  # no change after this state is missed
         state = await self.state()
         check_condition(name, signals_of(state).find(name).range is not None, above, below)

@@ -16,9 +16,10 @@ from typing import Any, TypeVar
 from common import messages as m
 from common import topics
 from common.application import applications
+from common.client.arguments import require_seconds
 from common.client.subscriptions import Subscriptions
 from common.config import check
-from common.errors import ConfigError, RequestFailed, RequestLost, ZencellError
+from common.errors import RequestFailed, RequestLost, ZencellError
 from common.time_source import new_id, wall_ns
 from common.transport.bus import Bus
 from common.transport.reader import Reader
@@ -132,8 +133,7 @@ class OperatorMotion:
         force: Mapping[str, Any] | None = None,
     ) -> m.MotionStatus:
         """Follow a trajectory; interlocks newer than `acknowledged` block it."""
-        if not isinstance(timeout, int | float) or not timeout > 0:
-            raise ConfigError("timeout", timeout, "must be more than 0 [s]")
+        require_seconds("timeout", timeout)
         await self.release_holds(acknowledged)
         request = m.ExecuteRequest(
             header=self._bus.header(), id=_new_goal_id(), trajectory=trajectory, owner=self._owner(),
@@ -273,16 +273,6 @@ class JogFailed(ZencellError):
     def __init__(self, owner: str, why: str) -> None:
         super().__init__(f"the arm is not jogged: the motion is {owner}{why and f'; {why}'}. See the executor's log: "
                          "zencell topic echo log/trajectory_executor")
-
-
-def check_seconds(seconds: float, field: str = "seconds") -> None:
-    """Check the duration of jogging [s], given in a field.
-
-    Raises:
-        ConfigError: it is out of bounds.
-    """
-    if not 0 < seconds <= LONGEST_JOG:
-        raise ConfigError(field, seconds, f"must be more than 0 and at most {LONGEST_JOG:g} s")
 
 
 class Jogging:

@@ -10,6 +10,7 @@ from typing import Any
 from pydantic_core import to_jsonable_python
 
 from common import topics
+from common.client.arguments import require_text
 from common.client.joining import TOKENS_TIMEOUT, operator_name
 from common.client.subscriptions import Part
 from common.config import check
@@ -220,10 +221,15 @@ class Parameters(Part):
 
     async def set(self, path: str, value: object) -> None:
         """Change one parameter; see `change`."""
+        require_text("path", path)
         await change(self._bus, {path: value})
 
     async def update(self, values: Mapping[str, Any]) -> None:
         """Change several parameters, all of them or none; see `change`."""
+        if not isinstance(values, Mapping):
+            raise ConfigError("values", values, "must be a mapping of values by path")
+        for path in values:
+            require_text("path", path)
         await change(self._bus, values)
 
     async def all(self) -> dict[str, Any]:
@@ -242,6 +248,7 @@ class ParameterValue:
 
     def __init__(self, bus: Bus, path: str) -> None:
         """A parameter by its path; nothing is read yet."""
+        require_text("path", path)
         self._bus, self._path = bus, path
 
     async def get(self) -> Any:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from common import topics
+from common.client.arguments import given
 from common.client.goals import Point, array_of, numbers, pose_of
 from common.client.subscriptions import Part, Subscriptions
 from common.config import check
@@ -70,18 +71,18 @@ class World(Part):
         """The world of a cell."""
         self._bus, self._subscriptions = bus, subscriptions
 
-    async def edit(self, op: str, **fields: Any) -> list[str]:
+    async def edit(self, op: str, /, **fields: Any) -> list[str]:
         """Edit the world with the fields of a `WorldEdit`, and return the ids of all objects."""
-        edit = check(WorldEdit, {"op": op, **fields}, "world")
+        edit = check(WorldEdit, given({"op": op}, fields, own=()), "world")
         return (await self._bus.client(topics.WORLD_EDIT).call(edit, TIMEOUT)).ids
 
     async def add(self, x: float, y: float, **more: Any) -> list[str]:
         """Add an object at a position [m]; fields that are not given are those of the first object."""
-        return await self.edit("add", position={"x": x, "y": y}, **more)
+        return await self.edit("add", **given({"position": {"x": x, "y": y}}, more, own=()))
 
     async def move(self, name: str, x: float, y: float, **more: Any) -> list[str]:
         """Move an object to another position [m]."""
-        return await self.edit("move", id=name, position={"x": x, "y": y}, **more)
+        return await self.edit("move", **given({"id": name, "position": {"x": x, "y": y}}, more, own=()))
 
     async def remove(self, name: str) -> list[str]:
         """Remove an object."""

@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 from typing import Generic, TypeVar
 
 from common import topics
+from common.client.arguments import require_text
 from common.client.subscriptions import NothingReceived, Part
 from common.errors import ConfigError, NoResponder, UnknownName
 from common.transport.bus import Bus
@@ -47,6 +48,7 @@ class Arms(Part, Generic[A]):
         self._known: dict[str, A] = {}
 
     def __getitem__(self, name: str) -> A:
+        require_text("arm", name)
         if name not in self._known:
             self._known[name] = self._arm_of(name)
         return self._known[name]

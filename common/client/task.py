@@ -10,8 +10,10 @@ from typing import Any, TypeVar
 
 from common import topics
 from common.application import find_application
+from common.client.arguments import require_seconds
 from common.client.joining import newest_interlock, supervisor_status
 from common.client.subscriptions import Part, Subscriptions, local_key, topic_of_owner
+from common.config import check
 from common.errors import NoResponder, RequestFailed, UnknownName, ZencellError
 from common.messages import HoldRequest, MotionStatus, StopRequest, TaskCommand, TaskStatus
 from common.topics import Topic
@@ -57,8 +59,8 @@ async def send_task_command(
         acknowledged: `since` of the newest interlock that the operator knows; a start or resume releases no newer one.
         timeout: [s, wall].
     """
-    request = TaskCommand.model_validate(
-        {"command": command, "by": operator, "override": override, "acknowledged": acknowledged})
+    request = check(
+        TaskCommand, {"command": command, "by": operator, "override": override, "acknowledged": acknowledged}, command)
     return await client.call(request, timeout)
 
 
@@ -212,6 +214,8 @@ class TaskControl(Part):
         Raises:
             TimeoutError: it is not after `timeout` [s, wall]; without one this waits forever.
         """
+        if timeout is not None:
+            require_seconds("timeout", timeout)
         async with asyncio.timeout(timeout), contextlib.aclosing(aiter(self)) as statuses:
             async for status in statuses:
                 if status.state in ENDED:
