@@ -319,7 +319,7 @@ class RequestHandlers:
         wanted = [] if request.running is None else ["on" if request.running else "off"]
         wanted += [] if request.speed is None else [f"{request.speed:g} m/s"]
         self._log.info("conveyor %s: %s by %s", request.name or state.belts[0].name, ", ".join(wanted) or "unchanged",
-                       request.owner or "the task")
+                       request.owner)
         return state
 
     async def edit(self, request: WorldEdit) -> WorldEditReply:

@@ -6,7 +6,16 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from common.messages.basics import SMALL_BYTES, Finite, Header, Label, Message, Name, OperatorName
+from common.messages.basics import (
+    SMALL_BYTES,
+    UNKNOWN_OPERATOR,
+    Finite,
+    Header,
+    Label,
+    Message,
+    Name,
+    OperatorName,
+)
 from common.messages.execution import Acknowledged
 
 MAX_BELTS = 8
@@ -46,6 +55,7 @@ class ConveyorSet(Message):
     running: bool | None = Field(None, description="null: as it is")
     speed: Annotated[float, Field(ge=-2, le=2, allow_inf_nan=False)] | None = Field(
         None, description="while it runs [m/s]; null: as it is")
-    owner: OperatorName = Field("", description="operator who requests it; empty for a task")
+    owner: OperatorName = Field(
+        UNKNOWN_OPERATOR, min_length=1, description="operator, or service of a task, that requests it")
     acknowledged: Acknowledged = Field(
         None, description="`since` of the newest interlock that the operator has seen: later ones block a start")

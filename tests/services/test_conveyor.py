@@ -28,6 +28,15 @@ def test_belt_is_switched_by_its_owner_and_stopped_by_a_stop(tmp_path: Path) -> 
             await client.own.call(m.OwnRequest(act="take", owner="bob"))
             with pytest.raises(RemoteError, match="bob"):
                 await set_.call(m.ConveyorSet(running=True, owner="ann"))
+            await client.own.call(m.OwnRequest(act="give", owner="bob"))
+            await client.own.call(m.OwnRequest(act="take", owner="a_task", kind="task"))
+            with pytest.raises(RemoteError, match="a_task"):  # a request without an owner is not the task's
+                await set_.call(m.ConveyorSet(running=True))
+            with pytest.raises(ValueError, match="owner"):
+                m.ConveyorSet(running=True, owner="")
+            assert (await set_.call(m.ConveyorSet(running=True, owner="a_task"))).belts[0].running
+            await client.own.call(m.OwnRequest(act="give", owner="a_task", kind="task"))
+            await client.own.call(m.OwnRequest(act="take", owner="bob"))
             assert not (await set_.call(m.ConveyorSet(running=False, owner="ann"))).belts[0].running
             await set_.call(m.ConveyorSet(running=True, owner="bob"))
             await client.stop.call(m.StopRequest(by="operator", owner="cat"))
