@@ -36,7 +36,7 @@ def read_robots(tree: dict[str, Any], overridden: Mapping[str, Any], folder: Pat
     if not isinstance(robots, dict) or not robots:
         raise ConfigError("robots", robots, "must be a mapping of arms, as in {left: NAME, right: {robot: NAME, "
                           "base_position: [1.0, 0, 0]}}")
-    tree["robots"] = {_arm_name(name): _robot(str(name), value, folder) for name, value in robots.items()}
+    tree["robots"] = {_arm_name(name): read_arm(str(name), value, folder) for name, value in robots.items()}
     tree["robot"] = next(iter(tree["robots"].values()))
 
 
@@ -52,7 +52,17 @@ def _arm_name(name: Any) -> str:
     return name
 
 
-def _robot(name: str, value: Any, folder: Path) -> dict[str, Any]:
+def read_arm(name: str, value: Any, folder: Path | None) -> dict[str, Any]:
+    """Return the robot of an arm, by its name, or by a mapping that may change some of its values.
+
+    Args:
+        name: of the arm.
+        value: as in the cell file.
+        folder: paths are relative to it; None: to the working directory.
+
+    Raises:
+        ConfigError, UnknownName: one line naming the field, the value and the choices.
+    """
     field = f"robots.{name}"
     if isinstance(value, str):
         return read_robot(find_file("robots", value, folder))
@@ -62,7 +72,7 @@ def _robot(name: str, value: Any, folder: Path) -> dict[str, Any]:
     base = values.pop("robot", None)
     if base is not None and not isinstance(base, str):
         raise ConfigError(f"{field}.robot", base, f"must be a name; choices: {', '.join(names_of('robots'))}")
-    own = with_absolute_paths(values, folder)
+    own = with_absolute_paths(values, folder or Path.cwd())
     return {**read_robot(find_file("robots", base, folder)), **own} if base is not None else own
 
 

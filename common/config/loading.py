@@ -13,7 +13,7 @@ from pydantic_core import to_jsonable_python
 
 from common.application import application_of_task, applications, find_application, import_from_folder_of
 from common.arms import arm_table
-from common.config.arms import read_robots, require_arm, services_of_arms
+from common.config.arms import read_arm, read_robots, require_arm, services_of_arms
 from common.config.basics import Parameters, check, is_section, own_fields
 from common.config.cell import Cell
 from common.config.files import (
@@ -153,6 +153,7 @@ def load_cell(
     services = tree["services"] = services_of_arms(services, arms)
     _apply_overrides(tree, parsed)
     if arms:
+        tree["robots"] = {arm: check(RobotConfig, tree["robots"][arm], f"robots.{arm}") for arm in arms}
         tree["robot"] = tree["robots"][arms[0]]
     if "run" in tree:
         raise ConfigError("run", tree["run"], "is no section of a cell: autostart and seed are top-level fields")
@@ -214,6 +215,10 @@ def _apply_overrides(tree: dict[str, Any], overrides: Iterable[tuple[list[str], 
             before = _at(tree, parts)
             camera = {**(before if isinstance(before, dict) else {}), **read_camera(Path(value).expanduser())}
             _override(tree, parts, camera)
+        elif parts[0] == "robots" and len(parts) > 1:
+            if parts[1] not in (arms := tree.get("robots", {})):
+                raise UnknownName("arm", parts[1], arms)
+            _override(tree, parts, read_arm(parts[1], value, None) if len(parts) == 2 else value)
         elif len(parts) > 1 or parts[0] not in SECTIONS:
             _override(tree, parts, value)
 

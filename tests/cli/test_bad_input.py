@@ -60,6 +60,7 @@ ROWS = [  # a command, and parts of its line
     ("run panda --speed fast", "--speed", "fast"),
     ("robot identify-payload --poses 3", "--poses", "3", "must be 4 to 12"),
     ("robot identify-payload --poses many", "--poses", "many", "whole number"),
+    ("robot identify-payload --poses -3", "--poses: '-3' must be a whole number, 4 to 12"),
     ("robot identify-payload --speed 2", "--speed", "2", "must be 0.01 to 1"),
     ("run panda --set robot.wrench.bandwidth=0", "robot.wrench.bandwidth", "0"),
     ("run panda --seed -1", "seed", "-1", "0 or more"),

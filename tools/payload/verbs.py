@@ -21,7 +21,7 @@ def identify_payload(
     from tools.payload import measurement
 
     if not poses.isdecimal():
-        raise ConfigError("--poses", poses, "must be a whole number")
+        raise ConfigError("--poses", poses, "must be a whole number, 4 to 12")
     try:
         share = float(speed)
     except ValueError:

@@ -83,6 +83,10 @@ async def test_keys_of_arms_are_below_their_names_and_have_one_owner() -> None:
     ("robots=[panda]", r"robots: \['panda'\] must be a mapping of arms"),
     ("robots={left: 3}", r"robots\.left: 3 must be a name or a mapping; choices: fr3, panda, ur5"),
     ("robot=panda", "robot: and robots are given"),
+    ("robots.left=NAME", "unknown robot 'NAME'; choices: fr3, panda"),
+    ("robots.left=3", r"robots\.left: 3 must be a name or a mapping; choices: fr3, panda"),
+    ("robots.left={robot: panda, nonsense: 1}", r"robots\.left\.nonsense: 1 is not a parameter"),
+    ("robots.lefty=panda", "unknown arm 'lefty' .did you mean 'left'"),
     ("robots.right.base_position=[0, 0.40, 0]", r"robots\.right\.base_position: .* is 0\.050 m from the base of left"),
     ("robots.right.joints=[]", r"robots\.right\.joints: "),
 ])
