@@ -51,8 +51,8 @@ async def run(bus: Bus, config: Config) -> None:
             code = getattr(problem, "code", "unanswered")
             done = [other for other in arms if other not in failed]
             raise Refused(code, f"{arm}: {problem}" + (f"; done by {', '.join(done)}" if done else ""))
-        now = newest()
-        return m.TaskStatus.model_validate({name: getattr(now, name) for name in m.TaskStatus.model_fields})
+        return combined(m.TaskStatus, {arm: each for arm, each in zip(arms, answers, strict=True) if isinstance(
+            each, m.TaskStatus)}, len(arms))
 
     bus.serve(topics.TASK_COMMAND, obey)
     await bus.ready()

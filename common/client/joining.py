@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from common import topics
+from common.arms import arms_topic
+from common.client.several_arms import arm_names
 from common.clock import Clock
 from common.config import default_cell, load_cell, names_of
 from common.errors import ConfigError, DecodeError, NoRouter, RequestFailed, UnknownName, ZencellError
@@ -230,9 +232,13 @@ async def cell_clock(bus: Bus) -> Clock:
 
 
 async def newest_interlock(bus: Bus) -> int:
-    """Return `since` of the newest interlock, 0 if unknown; a start releases no newer one."""
+    """Return `since` of the newest interlock, of all arms of a cell; 0 if unknown; a start releases no newer one."""
+    samples = await bus.raw_get(bus.full_key(topics.MOTION_STATUS), QUERY_TIMEOUT)
+    if not samples:
+        for arm in await arm_names(bus):
+            samples += await bus.raw_get(bus.full_key(arms_topic(topics.MOTION_STATUS, arm)), QUERY_TIMEOUT)
     newest = 0
-    for sample in await bus.raw_get(bus.full_key(topics.MOTION_STATUS), QUERY_TIMEOUT):
+    for sample in samples:
         with contextlib.suppress(DecodeError):
             newest = max(newest, decode(MotionStatus, sample.payload).newest)
     return newest

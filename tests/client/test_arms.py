@@ -1,5 +1,6 @@
 """A program in a cell with several arms: each is moved, held and asked by its name."""
 
+import asyncio
 from pathlib import Path
 
 import numpy as np
@@ -41,10 +42,21 @@ def test_request_without_an_arm_and_unknown_arm_are_one_line_with_the_choices() 
     run(program, CELL)
 
 
-def test_stop_that_names_no_arm_stops_both() -> None:
+def test_stop_that_names_no_arm_stops_both_until_a_start_that_knew_it() -> None:
+    async def stopped(cell: Cell) -> list[bool]:
+        return [bool((await cell.arms[name].status()).stopped) for name in ("left", "right")]
+
     async def program(cell: Cell) -> None:
         await cell.task.stop()
-        for name in ("left", "right"):
-            assert (await cell.arms[name].status()).stopped
+        assert await stopped(cell) == [True, True]
+        await cell.call("motion/stop")  # of an unknown operator
+        seen = (await cell.arms["left"].status()).newest
+        await cell.call("motion/stop", reason="intruder")
+        await asyncio.sleep(0.1)
+        answer = await cell.call("task/command", command="start", acknowledged=seen)
+        assert answer.message.count("by operator (intruder): start to go on") == 2  # of each arm
+        assert await stopped(cell) == [True, True]
+        await cell.task.start()
+        assert await stopped(cell) == [False, False]
 
     run(program, CELL)
