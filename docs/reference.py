@@ -165,9 +165,10 @@ def client() -> str:
 
 
 def members(part: type) -> list[tuple[str, Any]]:
-    """What a class offers to programs, in the order in which it is written."""
+    """What a class offers to programs, in the order in which it is written, what it inherits first."""
     found = []
-    for name, value in vars(part).items():
+    classes = reversed(part.__mro__[:-1])
+    for name, value in {name: value for each in classes for name, value in vars(each).items()}.items():
         plain = value.__func__ if isinstance(value, classmethod | staticmethod) else value
         public = not name.startswith("_") or (name == "__init__" and part is Cell)
         if public and (inspect.isfunction(plain) or isinstance(plain, property)):
