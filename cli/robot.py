@@ -192,8 +192,7 @@ def jog(
         joints[name] = options.number("--joint", value)
     request: dict[str, Any] = {
         "joints": joints, "linear": options.three("--linear", linear or "0,0,0"),
-        "angular": options.three("--angular", angular or "0,0,0"), "frame": frame,
-        "seconds": duration}
+        "angular": options.three("--angular", angular or "0,0,0"), "frame": frame, "seconds": duration}
     at.join(lambda cell: cell.arm.jog(**request))
 
 
