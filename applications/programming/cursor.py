@@ -162,5 +162,5 @@ class Cursor:
             return
         if status.step and not self.program.is_leaf(self.position):
             return  # the control flow is followed at once
-        status.step, status.kind, status.within = self.step.id, getattr(self.step, "step", ""), self.file.name
+        status.step, status.kind, status.within = self.step.id, self.step.step, self.file.name
         status.line, status.repetitions = self.file.lines.get(self.step.id, 0), self.program.repetitions(self.position)

@@ -6,13 +6,17 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import count
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
-from applications.programming.model import STEPS, BaseStep, Call, Program, as_data, walk
+from applications.programming import handling  # noqa: F401 its kinds of steps are registered
+from applications.programming.model import BaseStep, Program, as_data, walk
+from applications.programming.steps import Call
 from common.atomic_file import write_atomically
 from common.config import parse_yaml
 from common.errors import ConfigError, UnknownName, ZencellError
@@ -38,7 +42,7 @@ class ProgramFile:
     program: Program
     lines: dict[str, int] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def steps(self) -> dict[str, BaseStep]:
         """All steps by their id, in the order of the file."""
         return {step.id: step for _, step in walk(self.program.steps)}
@@ -47,17 +51,6 @@ class ProgramFile:
         """Return file, line and step in words, for messages."""
         line = self.lines.get(step.id)
         return f"{self.path.name}{f':{line}' if line else ''}: {step.id}"
-
-    def at(self, id_: str) -> BaseStep:
-        """Return the step of an id.
-
-        Raises:
-            UnknownName: lists the choices.
-        """
-        steps = self.steps
-        if id_ not in steps:
-            raise UnknownName("step", id_, steps)
-        return steps[id_]
 
 
 def names_in(folder: Path) -> list[str]:
@@ -112,7 +105,7 @@ def parse_program(text: str, path: Path) -> ProgramFile:
         program = Program.model_validate(tree)
     except ValidationError as error:
         raise BadProgram([_problem(path, lines, each) for each in error.errors(include_url=False)]) from None
-    twice = [id_ for id_, count in Counter(step.id for _, step in walk(program.steps) if step.id).items() if count > 1]
+    twice = [id_ for id_, times in Counter(step.id for _, step in walk(program.steps) if step.id).items() if times > 1]
     if twice:
         raise BadProgram([f"{path}: id: {twice[0]!r} is given to several steps; each needs its own"])
     program = with_ids(program)
@@ -137,25 +130,19 @@ def text_of(program: Program) -> str:
 def with_ids(program: Program) -> Program:
     """Return the program with an id for each step that has none: its kind and a number."""
     used = {step.id for _, step in walk(program.steps)}
-    numbers: Counter[str] = Counter()
 
-    def named(step: Any) -> Any:
+    def named(step: BaseStep) -> BaseStep:
         changed: dict[str, Any] = {name: [named(each) for each in getattr(step, name)] for name in step.BODIES}
-        if not step.id:
-            changed["id"] = new_id(step.step, numbers, used)
-        return step.model_copy(update=changed) if changed else step
+        return step.model_copy(update={**changed, "id": step.id or new_id(step.step, used)})
 
     return program.model_copy(update={"steps": [named(step) for step in program.steps]})
 
 
-def new_id(kind: str, numbers: Counter[str], used: set[str]) -> str:
+def new_id(kind: str, used: set[str]) -> str:
     """Return the next free id for a step of a kind, and mark it as used."""
-    while True:
-        numbers[kind] += 1
-        found = f"{kind}{numbers[kind]}"
-        if found not in used:
-            used.add(found)
-            return found
+    found = next(id_ for number in count(1) if (id_ := f"{kind}{number}") not in used)
+    used.add(found)
+    return found
 
 
 def load_all(file: ProgramFile) -> dict[str, ProgramFile]:
@@ -200,42 +187,25 @@ def _lines(node: yaml.Node | None, place: str = "") -> Iterator[tuple[str, int]]
 
 def _problem(path: Path, lines: Mapping[str, int], error: Mapping[str, Any]) -> str:
     """Return one validation error as a line with file, line, path of the field, value and choices."""
-    place, model = "", cast("type[BaseModel]", Program)
+    place = ""
     for part in error["loc"]:
         if isinstance(part, int):
             place += f"[{part}]"
-        elif place.endswith("]") and part in STEPS and place.rpartition("[")[0].rpartition(".")[2] in _BODIES:
-            model = STEPS[part]  # the discriminator, which is no field
         elif "-" not in part and not part.endswith("]"):  # not a branch of a union, such as constrained-float
             place = f"{place}.{part}".lstrip(".")
     known = place
     while known and known not in lines:
         known = known[: max(known.rfind("."), known.rfind("["), 0)]
-    line = f":{lines[known]}" if known else ""
+    where = f"{path}:{lines[known]}" if known else str(path)
     text = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("Input ", "")
-    if error["type"] == "extra_forbidden":
-        text = f"is not a field; choices: {', '.join(_fields_at(model, place))}"
-    elif error["type"] == "missing":
-        return f"{path}{line}: {place}: is missing"
-    elif error["type"] in ("union_tag_invalid", "union_tag_not_found"):
-        given = error["input"].get("step") if isinstance(error["input"], dict) else error["input"]
-        return f"{path}{line}: {place}.step: {given!r} is not a step; choices: {', '.join(STEPS)}"
-    elif error["type"] == "value_error":
-        return f"{path}{line}: {place or 'program'}: {text}"
-    return f"{path}{line}: {ConfigError(place, error['input'], text)}"
+    if error["type"] == "missing":
+        return f"{where}: {place}: is missing"
+    if error["type"] == "value_error":
+        return f"{where}: {place or 'program'}: {text}"
+    return f"{where}: {ConfigError(place, error['input'], text)}"
 
 
 _BODIES = ("steps", "then", "else")
-
-
-def _fields_at(model: type[BaseModel], place: str) -> list[str]:
-    """Return the fields of the model that a path leads to, below a step or the program."""
-    from applications.programming.model import Condition, Target
-
-    parts = place.rpartition("]")[2].strip(".").split(".")
-    if len(parts) > 1 or place.rpartition(".")[0].rpartition(".")[2].startswith("points["):
-        model = Condition if parts[0] in ("for", "while", "when") else Target
-    return sorted(info.alias or name for name, info in model.model_fields.items())
 
 
 def _yaml(value: Any, indent: str) -> Iterator[str]:

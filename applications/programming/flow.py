@@ -11,9 +11,10 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict
 
 from applications.programming.files import ProgramFile
-from applications.programming.model import BaseStep, Call, Condition, If, Loop, Palletize
+from applications.programming.handling import Palletize
+from applications.programming.model import BaseStep, Condition
+from applications.programming.steps import Call, If, Loop
 from common.errors import UnknownName
-from common.messages import Pose
 from common.tasks.palletizing import Pattern, slots
 
 TOP = ""  # owner of the frame of a program itself
@@ -71,7 +72,7 @@ class Flow:
         body = self._body(frame)
         owner = self._steps[frame.program].get(frame.owner)
         if isinstance(owner, Palletize) and frame.index == len(body):
-            return placing(owner, frame.turn)
+            return owner.placing(frame.turn)
         return body[frame.index]
 
     def find(self, id_: str) -> Position:
@@ -85,8 +86,8 @@ class Flow:
                 here = (*above, frame.model_copy(update={"index": index}))
                 if step.id == id_:
                     return here
-                for name, (_, inner) in zip(type(step).BODIES, step.bodies(), strict=True):
-                    found = search(inner, here, Frame(program=self.main, owner=step.id, body=name))
+                for name in type(step).BODIES:
+                    found = search(getattr(step, name), here, Frame(program=self.main, owner=step.id, body=name))
                     if found is not None:
                         return found
             return None
@@ -173,19 +174,3 @@ class Flow:
 def places_of(step: Palletize) -> int:
     """Return the number of places on a pallet."""
     return len(slots(step.pattern))
-
-
-def placing(step: Palletize, number: int) -> PlaceOnPallet:
-    """Return the step that places an item at a place of a pallet, counted from 0."""
-    return PlaceOnPallet(id=step.id, on_failure=step.on_failure, distance=step.distance, speed=step.speed,
-                         slot=slots(step.pattern)[number].pose, height=step.height)
-
-
-class PlaceOnPallet(BaseStep):
-    """Place the held item with its centre at a pose in world."""
-
-    step: Literal["place"] = "place"
-    slot: Pose
-    height: float  # as of Palletize
-    distance: float
-    speed: float | None

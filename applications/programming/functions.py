@@ -7,11 +7,13 @@ import importlib
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from applications.programming.model import Python
 from common.errors import ConfigError
 from common.plugins import extend_path, where_searched
+
+if TYPE_CHECKING:
+    from applications.programming.steps import Python
 
 
 def find_function(reference: str, folder: Path) -> Callable[..., Any]:

@@ -1,4 +1,4 @@
-"""A program as data: typed steps in a YAML file. docs/programs.md describes them.
+"""A program as data: typed steps in a YAML file, see docs/programs.md. The kinds are in steps.py and handling.py.
 
     cell: panda
     steps:
@@ -11,16 +11,30 @@ Positions are those of the tool centre point in world [m], joint positions are i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, SerializerFunctionWrapHandler, model_serializer
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializeAsAny,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+)
 from pydantic import model_validator as after
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from common.config import Number
-from common.tasks.palletizing import Pattern
 
-Distance = Annotated[float, Field(gt=0, le=2, allow_inf_nan=False)]  # [m]
+if TYPE_CHECKING:
+    from applications.programming.building import Builder, Built
+    from applications.programming.targets import Cell
+
+Distance = Annotated[float, Field(gt=0, le=2, allow_inf_nan=False, description="[m]")]
 Bounded = Annotated[Number, Field(ge=-1000, le=1000)]
 Metres3 = tuple[Bounded, Bounded, Bounded]
 Share = Annotated[float, Field(gt=0, le=1)]
@@ -31,20 +45,59 @@ DOWN = (math.pi, 0.0, 0.0)  # roll, pitch, yaw of a tool that points down [rad]
 MOST_STEPS = 1000
 
 
-class Part(BaseModel):
-    """Base of everything in a program."""
+def _error(kind: str, text: str, choices: Sequence[str], key: str, value: Any) -> InitErrorDetails:
+    return {"type": PydanticCustomError(kind, f"{text}; choices: {', '.join(choices)}"),  # type: ignore[arg-type]
+            "loc": (key,), "input": value}
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+class Part(BaseModel):
+    """Base of everything in a program. A field's unit is in its description, its first value on the page in `examples`.
+
+    Attributes:
+        ONE_OF: alternatives by their label on the page: keys of each, of whose first ones exactly one is given; at most
+            one if an alternative has none.
+    """
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, populate_by_name=True)
+    ONE_OF: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+
+    @classmethod
+    def keys(cls) -> dict[str, str]:
+        """Return the attributes by their keys in the file."""
+        return {info.alias or name: name for name, info in cls.model_fields.items()}
+
+    @after(mode="before")
+    @classmethod
+    def _require_known_keys(cls, value: Any) -> Any:
+        if isinstance(value, dict):
+            known = cls.keys()
+            unknown = [_error("unknown_field", "is not a field", sorted(known), key, given)
+                       for key, given in value.items() if key not in known and key not in cls.model_fields]
+            if unknown:
+                raise ValidationError.from_exception_data(cls.__name__, unknown)
+        return value
+
+    @after(mode="after")
+    def _require_one(self) -> Self:
+        keys = [some[0] for some in self.ONE_OF.values() if some]
+        given = [key for key in keys if getattr(self, self.keys()[key]) not in ("", None)]
+        if keys and len(given) != 1 and (given or () not in self.ONE_OF.values()):
+            raise ValueError(f"a {type(self).__name__.lower()} has exactly one of {', '.join(keys)}"
+                             + (f", not {' and '.join(given)}" if given else ""))
+        return self
 
 
 class Target(Part):
     """Where the tool moves: a name, joint positions, a pose in world, or a motion relative to the present pose."""
 
+    ONE_OF: ClassVar = {"named pose": ("name",), "joint positions": ("joints",), "tool pose": ("position", "rpy"),
+              "displacement": ("by", "turn", "frame")}
+
     name: str = Field("", description="pose of the program, of the robot file, or saved on the page")
     joints: list[Bounded] | None = Field(None, min_length=1, max_length=64, description="[rad, m]")
     position: Metres3 | None = Field(None, description="of the tool centre point in world [m]")
     rpy: Metres3 = Field(DOWN, description="roll, pitch, yaw about fixed axes, with position [rad]; default: down")
-    by: Metres3 | None = Field(None, description="displacement from the present pose [m]")
+    by: Metres3 | None = Field(None, description="displacement from the present pose [m]", examples=[[0.0, 0.0, 0.05]])
     turn: Metres3 = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw about the tool's own axes, with by [rad]")
     frame: Literal["world", "tool"] = Field("world", description="whose axes `by` follows")
 
@@ -53,53 +106,115 @@ class Target(Part):
     def _named(cls, value: Any) -> Any:
         return {"name": value} if isinstance(value, str) else value
 
-    @after(mode="after")
-    def _require_one(self) -> Target:
-        given = [name for name in ("name", "joints", "position", "by") if getattr(self, name) not in ("", None)]
-        if len(given) != 1:
-            raise ValueError("a target has exactly one of name, joints, position, by"
-                             + (f", not {' and '.join(given)}" if given else ""))
-        return self
-
     @model_serializer(mode="wrap")
     def _short(self, write: SerializerFunctionWrapHandler) -> Any:
         return self.name or write(self)
+
+    def __str__(self) -> str:
+        if self.joints is not None:
+            return "joints " + ", ".join(f"{math.degrees(each):.0f}" for each in self.joints)
+        numbers = ", ".join(f"{1e3 * each:.0f}" for each in self.position or self.by or ())
+        return self.name or f"{'here + ' if self.by else ''}{numbers} mm"
 
 
 class Condition(Part):
     """What a program decides by: a signal, whether the gripper holds something, or how the step before ended."""
 
+    ONE_OF: ClassVar = {"signal": ("signal", "value", "above", "below"), "gripper holds": ("holding",),
+              "outcome of the step before": ("outcome",)}
+
     signal: str = ""
     value: bool = True
     above: Number | None = None
     below: Number | None = None
-    holding: bool | None = None
-    outcome: str = Field("", max_length=80, description="succeeded, failed, or what a Python function returned")
+    holding: bool | None = Field(None, examples=[True])
+    outcome: str = Field("", max_length=80, description="succeeded, failed, or what a Python function returned",
+                         examples=["succeeded"])
 
-    @after(mode="after")
-    def _require_one(self) -> Condition:
-        given = [name for name in ("signal", "holding", "outcome") if getattr(self, name) not in ("", None)]
-        if len(given) != 1:
-            raise ValueError("a condition has exactly one of signal, holding, outcome"
-                             + (f", not {' and '.join(given)}" if given else ""))
-        return self
+    def __str__(self) -> str:
+        if not self.signal:
+            return f"outcome {self.outcome}" if self.outcome else (
+                f"the gripper holds {'something' if self.holding else 'nothing'}")
+        limits = [f"{word} {limit:g}" for word, limit in (("above", self.above), ("below", self.below))
+                  if limit is not None]
+        return f"{self.signal} {' and '.join(limits) or ('on' if self.value else 'off')}"
 
 
 class BaseStep(Part):
-    """What every step has. `id` is unique in a program; a missing one is chosen when the file is read."""
+    """A step. Each kind is one subclass, in steps.py or handling.py: files, page, dry run and export derive from it.
 
-    BODIES: ClassVar[tuple[str, ...]] = ()  # fields that hold further steps
+    Attributes:
+        BODIES: fields that hold further steps.
+        UNKNOWN: why a dry run does not know how long it takes.
+        ENDS_ANYWHERE: whether the state of the robot after it is not known before it runs; it is not repeated.
+        id: unique in a program; a missing one is chosen when the file is read.
+    """
 
+    BODIES: ClassVar[tuple[str, ...]] = ()
+    UNKNOWN: ClassVar[str] = ""
+    ENDS_ANYWHERE: ClassVar[bool] = False
+
+    step: str = ""  # kind
     id: Id = ""
     note: str = Field("", max_length=500)
     on_failure: Literal["stop", "continue"] = Field(
         "stop", description="stop with an error, or continue with the outcome failed")
 
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Register a kind."""
+        if kind := cls.model_fields["step"].default:
+            STEPS.setdefault(kind, cls)
+
+    def __str__(self) -> str:
+        """What it does in a few words, in millimeters and degrees."""
+        return self.step
+
+    def stages(self, at: Builder) -> Built:
+        """Return its stages, and what is expected after them; none by default.
+
+        Raises:
+            StepProblem: it cannot be done.
+        """
+        return at.built([])
+
+    def problems(self, cell: Cell, folder: Path) -> Iterator[tuple[str, str]]:
+        """Yield field and problem of what can never run in a cell, besides poses and signals."""
+        yield from ()
+
     def bodies(self) -> Iterator[tuple[str, Sequence[BaseStep]]]:
-        """Yield its lists of further steps, by field as in the file."""
-        for name in self.BODIES:
-            field = type(self).model_fields[name]
-            yield field.alias or name, getattr(self, name)
+        """Yield its lists of further steps by their keys."""
+        return ((key, getattr(self, name)) for key, name in self.keys().items() if name in self.BODIES)
+
+    def targets(self) -> Iterator[tuple[str, Target]]:
+        """Yield its targets by their keys."""
+        for key, name in self.keys().items():
+            value = getattr(self, name)
+            if isinstance(value, Target):
+                yield key, value
+            elif isinstance(value, list):
+                yield from ((f"{key}[{i}]", each) for i, each in enumerate(value) if isinstance(each, Target))
+
+    @model_serializer(mode="wrap")
+    def _with_kind(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {"step": self.step, **write(self)}
+
+
+STEPS: dict[str, type[BaseStep]] = {}  # by kind
+
+
+def _of_kind(value: Any) -> Any:
+    if isinstance(value, BaseStep):
+        return value
+    kind = value.get("step") if isinstance(value, dict) else value
+    if not isinstance(kind, str) or kind not in STEPS:
+        raise ValidationError.from_exception_data("step", [_error(
+            "unknown_step", "is not a step", list(STEPS), "step", kind)])
+    return STEPS[kind].model_validate(value)
+
+
+Step = Annotated[SerializeAsAny[BaseStep], BeforeValidator(_of_kind)]
+Steps = Annotated[list[Step], Field(min_length=1, max_length=MOST_STEPS)]
 
 
 class Motion(BaseStep):
@@ -110,193 +225,6 @@ class Motion(BaseStep):
     requires: dict[Word, bool] = Field({}, description="signals that must have these values during the motion")
 
 
-class Move(Motion):
-    """Move to a target."""
-
-    step: Literal["move"] = "move"
-    to: Target
-    straight: bool = Field(False, description="move the tool in a straight line")
-
-
-class Through(Motion):
-    """Move through several targets, in one motion with rounded corners, or with a stop at each."""
-
-    step: Literal["through"] = "through"
-    points: list[Target] = Field(min_length=1, max_length=200)
-    blend: Annotated[float, Field(ge=0, le=1)] = Field(0.0, description="radius of the corners [m]; 0: stop at each")
-    straight: bool = False
-
-
-class Approach(Motion):
-    """Move in front of a target, then straight to it."""
-
-    step: Literal["approach"] = "approach"
-    to: Target
-    distance: Distance = 0.1
-    axis: Literal["tool", "world"] = Field("tool", description="from behind along the tool's z axis, or from above")
-
-
-class Retreat(Motion):
-    """Move straight back from where the tool is."""
-
-    step: Literal["retreat"] = "retreat"
-    distance: Distance = 0.1
-    axis: Literal["tool", "world"] = Field("tool", description="back along the tool's z axis, or up")
-
-
-class Grip(BaseStep):
-    """Move the fingers."""
-
-    step: Literal["grip"] = "grip"
-    width: Annotated[float, Field(ge=0, le=0.2)] | Literal["open", "close"] = Field(description="[m]")
-    force: Annotated[float, Field(ge=0, le=1e4)] = Field(0.0, description="[N]; 0: the gripper's default")
-    holds: bool | None = Field(None, description="whether something must be held at the end")
-    expected_width: Annotated[float, Field(ge=0, le=0.2)] | None = Field(None, description="of what is held [m]")
-    width_tolerance: Annotated[float, Field(gt=0, le=0.2)] = Field(0.005, description="of expected_width [m]")
-    mass: Annotated[float, Field(ge=0, le=1000)] = Field(0.0, description="of what is held [kg]; 0: unknown")
-
-
-class Output(BaseStep):
-    """Set an output."""
-
-    step: Literal["output"] = "output"
-    signal: Word
-    value: bool | Number = True
-
-
-class Wait(BaseStep):
-    """Wait for a time [s], or for a signal."""
-
-    step: Literal["wait"] = "wait"
-    seconds: Annotated[float, Field(ge=0, le=86_400)] | None = None
-    until: Condition | None = Field(None, alias="for")
-    timeout: Timeout = Field(10.0, description="for the signal [s]")
-
-    @after(mode="after")
-    def _require_one(self) -> Wait:
-        if (self.seconds is None) == (self.until is None):
-            raise ValueError("a wait has either seconds or for")
-        if self.until is not None and not self.until.signal:
-            raise ValueError("a wait is for a signal")
-        return self
-
-
-class Loop(BaseStep):
-    """Repeat steps a number of times, or while a condition holds, or without end."""
-
-    BODIES: ClassVar[tuple[str, ...]] = ("steps",)
-
-    step: Literal["loop"] = "loop"
-    count: Annotated[int, Field(ge=0, le=10**9)] | None = None
-    condition: Condition | None = Field(None, alias="while")
-    steps: list[Step] = Field(min_length=1, max_length=MOST_STEPS)
-
-    @after(mode="after")
-    def _require_one(self) -> Loop:
-        if self.count is not None and self.condition is not None:
-            raise ValueError("a loop has either count or while")
-        return self
-
-
-class If(BaseStep):
-    """Do one of two lists of steps."""
-
-    BODIES: ClassVar[tuple[str, ...]] = ("then", "otherwise")
-
-    step: Literal["if"] = "if"
-    condition: Condition = Field(alias="when")
-    then: list[Step] = Field(min_length=1, max_length=MOST_STEPS)
-    otherwise: list[Step] = Field([], max_length=MOST_STEPS, alias="else")
-
-
-class Call(BaseStep):
-    """Do the steps of another program of the same folder."""
-
-    step: Literal["call"] = "call"
-    program: Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w-]+$")]
-
-
-class Pick(BaseStep):
-    """Grasp an object of the planning scene from above: the nearest one that fits."""
-
-    step: Literal["pick"] = "pick"
-    kind: str = Field("", max_length=80, description="class of the object as its detector names it; default: any")
-    role: Literal["target", "contained"] = Field("target", description="free, or in a container")
-    object: str = Field("", max_length=80, description="id of the object; default: any")
-    force: Annotated[float, Field(ge=0, le=1e4)] = Field(0.0, description="[N]; 0: that of the object or gripper")
-    timeout: Timeout = Field(5.0, description="until such an object is seen [s]")
-    speed: Share | None = None
-
-
-class Place(BaseStep):
-    """Move above a target, straight to it, open the fingers, and move back."""
-
-    step: Literal["place"] = "place"
-    at: Target = Field(description="of the tool centre point at the release")
-    distance: Distance = 0.1
-    speed: Share | None = None
-
-
-class Palletize(BaseStep):
-    """For each place of a pattern on a pallet: do `steps`, which bring an item into the gripper, and place it there."""
-
-    BODIES: ClassVar[tuple[str, ...]] = ("steps",)
-
-    step: Literal["palletize"] = "palletize"
-    pattern: Pattern
-    height: Number = Field(0.0, description="of the tool centre point above the centre of an item at the release; not "
-                                            "for an item that was picked by sight [m]")
-    distance: Distance = 0.1
-    speed: Share | None = None
-    steps: list[Step] = Field(min_length=1, max_length=MOST_STEPS)
-
-
-class Force(BaseStep):
-    """What steps have whose end the force at the tool decides. They are not repeated after a failure."""
-
-    direction: Metres3 = (0.0, 0.0, -1.0)
-    frame: Literal["base", "tool", "world"] = Field("world", description="whose axes the direction follows")
-    touch: list[Word] = Field([], max_length=50, description="ids or classes of objects that may be touched, also by "
-                                                             "what is held")
-
-
-class Until(Force):
-    """Move the tool straight until it presses with a force."""
-
-    step: Literal["until"] = "until"
-    force: Annotated[float, Field(gt=0, le=1000)] = Field(description="[N]")
-    max_distance: Distance = Field(0.05, description="without contact until there it fails [m]")
-    tool_speed: Annotated[float, Field(gt=0, le=0.25)] = Field(0.01, description="[m/s]")
-
-
-class Insert(Force):
-    """Press the held part, search its hole on a spiral, and push it in."""
-
-    step: Literal["insert"] = "insert"
-    depth: Distance = Field(description="below the first contact [m]")
-    force: Annotated[float, Field(gt=0, le=1000)] = Field(12.0, description="[N]")
-    max_distance: Distance | None = Field(None, description="from the start [m]; default: the depth and 20 mm")
-
-
-class Python(BaseStep):
-    """Call a function of the user, `module:function`; what it returns is the outcome."""
-
-    step: Literal["python"] = "python"
-    function: Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$", max_length=200)]
-    arguments: dict[str, JsonValue] = {}
-    timeout: Timeout = Field(10.0, description="[s]")
-
-
-Step = Annotated[
-    Move | Through | Approach | Retreat | Grip | Output | Wait | Loop | If | Call | Pick | Place | Palletize | Until
-    | Insert | Python,
-    Field(discriminator="step")]
-STEPS: dict[str, type[BaseStep]] = {
-    kind.model_fields["step"].default: kind
-    for kind in (Move, Through, Approach, Retreat, Grip, Output, Wait, Loop, If, Call, Pick, Place, Palletize, Until,
-                 Insert, Python)}
-
-
 class Program(Part):
     """Steps, and the poses that they name."""
 
@@ -304,7 +232,7 @@ class Program(Part):
     note: str = Field("", max_length=2000)
     speed: Share | None = Field(None, description="of all motions without one of their own")
     poses: dict[Word, Target] = {}
-    steps: list[Step] = Field(min_length=1, max_length=MOST_STEPS)
+    steps: Steps
 
     @after(mode="after")
     def _require_fixed_poses(self) -> Program:
@@ -312,10 +240,6 @@ class Program(Part):
             if target.name or target.by is not None:
                 raise ValueError(f"pose {name} must have joints or a position")
         return self
-
-
-for _model in (Loop, If, Palletize, Program):
-    _model.model_rebuild()
 
 
 def walk(steps: Sequence[BaseStep], above: str = "steps") -> Iterator[tuple[str, BaseStep]]:
@@ -329,14 +253,4 @@ def walk(steps: Sequence[BaseStep], above: str = "steps") -> Iterator[tuple[str,
 
 def as_data(program: Program) -> dict[str, Any]:
     """Return a program as its file contains it, without default values."""
-    data: dict[str, Any] = program.model_dump(mode="json", by_alias=True, exclude_defaults=True)
-    data["steps"] = [_step_data(step) for step in program.steps]
-    return data
-
-
-def _step_data(step: BaseStep) -> dict[str, Any]:
-    fields = step.model_dump(mode="json", by_alias=True, exclude_defaults=True)
-    for name, body in step.bodies():
-        if body:
-            fields[name] = [_step_data(each) for each in body]
-    return {"step": type(step).model_fields["step"].default, **fields}
+    return program.model_dump(mode="json", by_alias=True, exclude_defaults=True)

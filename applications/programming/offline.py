@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from applications.programming.export import Exporter
+from applications.programming.export import script
 from applications.programming.files import BadProgram, ProgramFile, load_all, load_program
 from applications.programming.flow import Flow
 from applications.programming.rehearsal import Rehearser, static_problems
@@ -172,4 +172,4 @@ def exported(path: Path, cell: str | None) -> str:
              for step, problem in static_problems(each, stages, loaded.io)]
     if found:
         raise BadProgram(found)
-    return Exporter(stages, files, file.name).script(name)
+    return script(files, file.name, name)

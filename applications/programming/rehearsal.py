@@ -8,24 +8,12 @@ from __future__ import annotations
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import replace
 
+from applications.programming.building import Builder, Outlook, ProgramMove
 from applications.programming.files import ProgramFile
 from applications.programming.flow import TRANSITIONS, Flow, Position
-from applications.programming.functions import find_function
-from applications.programming.model import (
-    BaseStep,
-    Condition,
-    Force,
-    Grip,
-    If,
-    Loop,
-    Motion,
-    Output,
-    Pick,
-    Python,
-    Wait,
-    walk,
-)
-from applications.programming.stages import Builder, Outlook, ProgramMove, StepCycle
+from applications.programming.handling import Pick
+from applications.programming.model import BaseStep, Condition, walk
+from applications.programming.steps import If, Loop, Wait
 from applications.programming.targets import Cell, NotSeen
 from applications.programming.topics import Rehearsal, RehearsedStep
 from common import messages as m
@@ -33,7 +21,6 @@ from common.config import Io
 from common.errors import ConfigError, UnknownName, ZencellError
 from common.robot.transforms import matrix_to_pose, pose_to_matrix
 from common.tasks import stages as engine
-from common.tasks.signals import Output as OutputStage
 from common.tasks.signals import WaitFor, check_condition
 from common.tasks.stages import View
 
@@ -49,46 +36,26 @@ def static_problems(file: ProgramFile, cell: Cell, io: Io) -> Iterator[tuple[Bas
 
 
 def _wrong(step: BaseStep, file: ProgramFile, cell: Cell, io: Io) -> Iterator[tuple[str, str]]:
-    for field in ("to", "at", "points"):
-        found = getattr(step, field, None)
-        for number, target in enumerate(found if isinstance(found, list) else [found] if found is not None else []):
-            if target.by is None:
-                try:
-                    cell.resolve(target, file.program.poses, None)
-                except ZencellError as error:
-                    yield field + (f"[{number}]" if field == "points" else ""), str(error)
-    for field, condition in (("for", getattr(step, "until", None)), ("when", getattr(step, "condition", None))):
-        if isinstance(condition, Condition) and condition.signal:
-            yield from _wrong_signal("while" if isinstance(step, Loop) else field, condition.signal, io,
-                                     condition=condition)
-    if isinstance(step, Output):
-        yield from _wrong_signal("signal", step.signal, io, value=step.value)
-    if isinstance(step, Motion):
-        for name in step.requires:
-            yield from _wrong_signal("requires", name, io)
-    if isinstance(step, Grip):
+    for key, target in step.targets():
+        if target.by is None:
+            try:
+                cell.resolve(target, file.program.poses, None)
+            except ZencellError as error:
+                yield key, str(error)
+    for key, name in step.keys().items():
         try:
-            Builder(cell, {}, None, Outlook(None, holding=False), View(0.0), StepCycle()).build(step)
-        except ZencellError as error:
-            yield "width", str(error)
-    if isinstance(step, Python):
-        try:
-            find_function(step.function, file.path.parent)
-        except ConfigError as error:
-            yield "function", f"{error.value!r} {error.expected}"
-
-
-def _wrong_signal(
-    field: str, name: str, io: Io, *, condition: Condition | None = None, value: bool | float | None = None
-) -> Iterator[tuple[str, str]]:
-    try:
-        signal = io.find(name, output=value is not None)
-        if value is not None:
-            signal.checked(name, value)
-        if condition is not None:
-            check_condition(name, signal.range is not None, condition.above, condition.below)
-    except (UnknownName, ConfigError) as error:
-        yield field, str(error)
+            value = getattr(step, name)
+            if isinstance(value, Condition) and value.signal:
+                signal = io.find(value.signal, output=False)
+                check_condition(value.signal, signal.range is not None, value.above, value.below)
+            elif key == "requires":
+                for each in value:
+                    io.find(each, output=False)
+            elif key == "signal":
+                io.find(value, output=True).checked(value, getattr(step, "value", True))
+        except (UnknownName, ConfigError) as error:
+            yield key, str(error)
+    yield from step.problems(cell, file.path.parent)
 
 
 class Rehearser:
@@ -147,14 +114,12 @@ class Rehearser:
         self._visited.add(step.id)
         self.result.step = step.id
         self.trajectories = []
-        item = RehearsedStep(program=file.name, step=step.id, kind=getattr(step, "step", ""))
+        item = RehearsedStep(program=file.name, step=step.id, kind=step.step)
         if problem := self._wrong.get(step.id, ""):
             item.problem = problem
             self._lost = self._lost or step.id
-        elif isinstance(step, Force):
-            item.unknown, self._lost = "the force decides where it ends", self._lost or step.id
-        elif isinstance(step, Python):
-            item.unknown = "the time that the function takes"
+        elif step.UNKNOWN:
+            item.unknown, self._lost = step.UNKNOWN, self._lost or (step.id if step.ENDS_ANYWHERE else "")
         elif isinstance(step, Wait) and step.seconds is not None:
             item.seconds = step.seconds
         else:
@@ -169,8 +134,8 @@ class Rehearser:
         main = self.flow.files[self.flow.main].program
         view = replace(self._view, scene=self.scene)
         try:
-            built = Builder(self.cell, file.program.poses, file.program.speed or main.speed, self._now, view,
-                            StepCycle()).build(step)
+            speed = file.program.speed or main.speed
+            built = Builder(self.cell, file.program.poses, speed, self._now, view).build(step)
         except NotSeen as error:
             item.unknown, self._lost = str(error), self._lost or step.id
             self._now = replace(self._now, holding=isinstance(step, Pick))
@@ -199,8 +164,6 @@ class Rehearser:
                     self._release()
             elif isinstance(stage, WaitFor):
                 unknown = f"the wait for {stage.condition}"
-            elif isinstance(stage, OutputStage):
-                unknown = ""
         item.seconds, item.unknown = (None if unknown else seconds), unknown
         self._now = replace(built.after, T_world_tcp=self.cell.robot.fk(self._q))
 

@@ -1,148 +1,143 @@
-"""Functions that exported programs use: parts of steps that are not one call of the client. `cell` is a blocking one.
-
-Poses are (4, 4), of the tool centre point in world.
-"""
+"""Steps in an exported script: each is carried out by calls of the blocking client, with the stages of the program."""
 
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
-import inspect
-import math
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Iterator, Mapping
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from applications.programming.building import Builder, Outlook, ProgramMove
+from applications.programming.cursor import FAILED, SUCCEEDED
+from applications.programming.functions import call_function
+from applications.programming.handling import Palletize
+from applications.programming.model import STEPS, BaseStep, Condition, Target
+from applications.programming.offline import cell_with, load_single
+from applications.programming.steps import Python, Wait
+from applications.programming.targets import Cell, NotSeen, StepProblem
 from common import messages as m
-from common.client.goals import goal_of
 from common.client.operator_motion import MotionFailed
-from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix, rpy_to_matrix, tool_down, transform
-from common.tasks.handling import DROP, grasp_directions
-from common.tasks.palletizing import Pattern, slot_at
-from common.tasks.stages import place_of
+from common.config import check
+from common.errors import ZencellError
+from common.robot.model import RobotModel
+from common.robot.transforms import matrix_to_pose
+from common.tasks.force import ForceMove
+from common.tasks.palletizing import Pattern, slots
+from common.tasks.signals import Output, WaitFor, condition_met
+from common.tasks.stages import MISSES, Grip, Stage, View
 from common.time_source import monotonic
 
-Array = NDArray[np.float64]
-NEAR = 0.2  # [m] from the tool: objects that the gripper may touch when it moves back
-ROOM = 0.02  # [m] by which the fingers open wider than the object
+
+@lru_cache
+def _config(cell: str) -> Cell:
+    loaded = load_single(cell)
+    return cell_with(loaded, RobotModel.load(loaded.robot))
 
 
-def backed(T: Array, distance: float, axis: str) -> Array:
-    """Return a pose moved back along the tool's z axis, or up for the axis `world` [m]."""
-    moved = T.copy()
-    moved[:3, 3] += (0.0, 0.0, distance) if axis == "world" else -distance * T[:3, 2]
-    return moved
+class Steps:
+    """Does steps in a cell, with a method for each kind and its fields: `do.move(to="home", speed=0.3)`.
 
-
-def relative(T: Array, by: Sequence[float], turn: Sequence[float], frame: str) -> Array:
-    """Return a pose displaced along the axes of a frame [m], and turned about the tool's own axes [rad]."""
-    moved = T.copy()
-    moved[:3, 3] += by if frame == "world" else T[:3, :3] @ np.array(by)
-    moved[:3, :3] = T[:3, :3] @ rpy_to_matrix(*turn)
-    return moved
-
-
-def blended(cell: Any, *targets: Any, radius: float, straight: bool) -> m.SequenceGoal:
-    """Return a goal that passes targets in one motion, with corners of a radius [m]."""
-    goals = [goal_of(target) for target in targets]
-    last = len(goals) - 1
-    return m.SequenceGoal.model_validate({"items": [
-        {"goal": goal, "straight": straight, "blend_radius": radius if number < last else 0.0}
-        for number, goal in enumerate(goals)]})
-
-
-def ids(cell: Any, names: Sequence[str]) -> list[str]:
-    """Return the ids of the objects with these ids or classes."""
-    return [each.id for each in cell.planning_scene().objects if each.id in names or each.kind in names]
-
-
-def near(cell: Any) -> list[str]:
-    """Return the ids of movable objects near the tool."""
-    at = cell.arm.pose()[:3, 3]
-    return [each.id for each in cell.objects() if math.dist(place_of(each.pose), at) < NEAR]
-
-
-def require_holding(state: m.GripperState, *, holding: bool = True) -> None:
-    """Require that the gripper holds something, or nothing.
-
-    Raises:
-        MotionFailed: it is otherwise.
+    Attributes:
+        outcome: of the step before: succeeded, failed, or what a Python function returned.
     """
-    if state.holding is not holding or (holding and state.outcome in ("too_wide", "too_narrow", "empty")):
-        raise MotionFailed("grasp", state.message or f"the gripper holds {'nothing' if holding else 'something'}")
+
+    def __init__(self, cell: Any, config: str, *, speed: float | None = None,
+                 poses: Mapping[str, Any] | None = None) -> None:
+        """Do steps in a blocking `cell` of a configuration; speed and poses are those of a program."""
+        self._cell, self._config, self._speed = cell, _config(config), speed
+        self._poses = {name: check(Target, target) for name, target in (poses or {}).items()}
+        self._patterns: list[Pattern] = []  # that are filled now
+        self.outcome = SUCCEEDED
+
+    def __getattr__(self, kind: str) -> Any:
+        """Return the method of a kind of step."""
+        if kind not in STEPS:
+            raise AttributeError(kind)
+        return partial(self._do_kind, kind)
+
+    def met(self, **condition: Any) -> bool:
+        """Return whether a condition holds."""
+        wanted = check(Condition, condition)
+        if wanted.signal:
+            return condition_met(self._cell.io.read(wanted.signal), wanted.value, wanted.above, wanted.below)
+        if wanted.holding is not None:
+            return bool(self._cell.gripper.state().holding is wanted.holding)
+        return self.outcome == wanted.outcome
+
+    def palletize(self, **fields: Any) -> Iterator[int]:
+        """Yield the number of each place of a pallet, then place there what the gripper holds."""
+        step = check(Palletize, {**fields, "steps": [{"step": "wait", "seconds": 0}]})
+        self._patterns.append(step.pattern)
+        for number in range(len(slots(step.pattern))):
+            yield number
+            self._do(step.placing(number))
+        self._patterns.pop()
+
+    def _do_kind(self, kind: str, **fields: Any) -> None:
+        self._do(check(STEPS[kind], {"id": kind, **fields}))
+
+    def _do(self, step: BaseStep) -> None:
+        try:
+            self.outcome = self._outcome(step)
+        except ZencellError:
+            if step.on_failure == "stop":
+                raise
+            self.outcome = FAILED
+
+    def _outcome(self, step: BaseStep) -> str:
+        if isinstance(step, Python):
+            outcome, problem = asyncio.run(call_function(step, Path.cwd()))
+            if problem:
+                raise StepProblem(problem)
+            return outcome or SUCCEEDED
+        if isinstance(step, Wait) and step.seconds is not None:
+            time.sleep(step.seconds)
+        for stage in self._stages(step):
+            self._carry_out(stage)
+        return SUCCEEDED
+
+    def _stages(self, step: BaseStep) -> list[Stage]:
+        ends = monotonic() + getattr(step, "timeout", 0.0)
+        while True:
+            cell = self._cell
+            view = View(0.0, scene=cell.planning_scene(), q=cell.arm.joints().tolist(),
+                        gripper=cell.gripper.state() if self._config.gripper is not None else None,
+                        tcp=matrix_to_pose(cell.arm.pose()))
+            try:
+                return Builder(self._config, self._poses, self._speed, Outlook.of(view), view,
+                               patterns=self._patterns).build(step).stages
+            except NotSeen:
+                if monotonic() > ends:
+                    raise
+            time.sleep(0.1)
+
+    def _carry_out(self, stage: Stage) -> None:
+        cell = self._cell
+        if isinstance(stage, ForceMove):
+            move = {"until": cell.arm.move_until, "insert": cell.arm.insert}[stage.kind]
+            move(force=stage.force, direction=stage.direction, frame=stage.frame, max_distance=stage.max_distance,
+                 touch={thing for _, thing in stage.touches}, **stage.fields)
+        elif isinstance(stage, ProgramMove):
+            for name, value in stage.requires.items():
+                cell.io.wait(name, value)
+            known = any(each.object.id == stage.attach for each in cell.planning_scene().attached)
+            cell.arm.move(
+                stage.goal, straight=stage.straight, speed=stage.speed, planner=stage.planner,
+                allowed_collisions=stage.touches, attach=stage.attach if stage.carries else "",
+                attach_pose=None if known else stage.attach_pose, release=not stage.carries)
+        elif isinstance(stage, Grip):
+            state = cell.gripper.move(stage.width, stage.effort, mass=stage.mass, expected=stage.expected_width,
+                                      tolerance=stage.width_tolerance)
+            _require(stage, state)
+        elif isinstance(stage, Output):
+            cell.io.set(stage.signal, stage.value)
+        elif isinstance(stage, WaitFor):
+            cell.io.wait(stage.signal, stage.value, stage.timeout, above=stage.above, below=stage.below)
 
 
-def pick(
-    cell: Any, *, closing_axis: str, approach: float, lowest: float, kind: str = "", role: str = "target",
-    object: str = "", force: float = 0.0, timeout: float = 5.0, outside: Sequence[Pattern] = (), **how: Any,
-) -> None:
-    """Grasp the fitting object that is nearest to the tool from above, and lift it.
-
-    Raises:
-        MotionFailed: none is seen, or it was not grasped.
-    """
-    ends, found = monotonic() + timeout, list[m.CollisionObject]()
-    while not found:
-        found = [each for each in cell.objects() if each.role == role and kind in ("", each.kind)
-                 and object in ("", each.id)
-                 and not any(slot_at(pattern, place_of(each.pose)) for pattern in outside)]
-        if not found and monotonic() > ends:
-            raise MotionFailed("not_seen", f"no {object or kind or 'object'} with role {role} is seen")
-    at = cell.arm.pose()[:2, 3]
-    thing = min(found, key=lambda each: math.dist(place_of(each.pose)[:2], at))
-    widest = cell.arm.description().gripper_width
-    yaw, width = grasp_directions(thing, closing_axis, widest)[0]
-    x, y, z = place_of(thing.pose)
-    T = tool_down(x, y, max(z, lowest), yaw)
-    cell.gripper.move(min((width or widest) + ROOM, widest))
-    cell.arm.move(backed(T, approach, "world"), **how)
-    cell.arm.move(T, straight=True, touch=[thing.id], **how)
-    closed = cell.gripper.close(force or thing.grip_effort, expected=width, tolerance=0.01, mass=thing.mass)
-    require_holding(closed)
-    cell.arm.move(backed(T, approach, "world"), straight=True, **how)
-
-
-def place(cell: Any, T: Array, distance: float, **how: Any) -> None:
-    """Place what is held at a pose, from above it, and move back [m]."""
-    state, widest = cell.gripper.state(), cell.arm.description().gripper_width
-    require_holding(state)
-    cell.arm.move(backed(T, distance, "world"), **how)
-    held = [each.object.id for each in cell.planning_scene().attached]
-    pairs = [(name, other) for name in held for other in _near(cell, T)]
-    cell.arm.move(T, straight=True, allowed_collisions=pairs, **how)
-    require_holding(cell.gripper.move(min(state.width + ROOM, widest)), holding=False)
-    cell.arm.move(backed(T, distance, "world"), straight=True, touch=near(cell), **how)
-
-
-def over_slot(cell: Any, slot: m.Pose, height: float) -> Array:
-    """Return the pose that places the held item at a slot of a pallet; `height` [m] for one that no camera saw."""
-    T_slot = backed(pose_to_matrix(slot), DROP, "world")
-    attached = cell.planning_scene().attached
-    if attached:
-        held = invert(pose_to_matrix(attached[0].object.pose))
-        turns = [T_slot @ transform(rpy_to_matrix(0, 0, turn), (0, 0, 0)) @ held for turn in (0.0, math.pi)]
-        return max(turns, key=lambda T: float(T[0, 0]))
-    yaw = math.remainder(math.atan2(T_slot[1, 0], T_slot[0, 0]), math.pi)
-    return transform(rpy_to_matrix(math.pi, 0.0, yaw), T_slot[:3, 3] + (0.0, 0.0, height))
-
-
-def call(function: Callable[..., Any], timeout: float, **arguments: Any) -> str:
-    """Return the outcome of a function, which may be asynchronous.
-
-    Raises:
-        TimeoutError: it takes longer than `timeout` [s].
-    """
-    with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        work = (lambda: asyncio.run(function(**arguments))) if inspect.iscoroutinefunction(function) else (
-            lambda: function(**arguments))
-        result = pool.submit(work).result(timeout)
-    if isinstance(result, bool):
-        return "succeeded" if result else "failed"
-    return "succeeded" if result is None else str(result)
-
-
-def _near(cell: Any, T: Array) -> list[str]:
-    at = matrix_to_pose(T)
-    return [each.id for each in cell.objects() if math.dist(place_of(each.pose), place_of(at)) < NEAR]
+def _require(stage: Grip, state: m.GripperState) -> None:
+    if stage.holds is not None and (state.holding is not stage.holds or (stage.holds and state.outcome in MISSES)):
+        raise MotionFailed("grasp", state.message or (
+            f"the gripper holds {'nothing' if stage.holds else 'something'}"))

@@ -162,6 +162,9 @@ class ProgramRunner(TaskRunner[View]):
     async def _run_program(self, request: ProgramCommand) -> None:
         task, status = self._program, self._program.status
         view = self._look()
+        if request.command == "resume" and not (status.halted or (status.started and status.state != "DONE")):
+            raise Refused("not_started", f"there is nothing to resume: {status.program or 'a program'} "
+                          f"{'has ended' if status.state == 'DONE' else 'was not started'}; run it")
         continues = request.command == "resume" or (
             request.command == "step" and not request.step and request.program in ("", status.program)
             and bool(task.at.position))

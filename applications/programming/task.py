@@ -12,12 +12,14 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
+from applications.programming.building import Builder, Built, Outlook, ProgramMove, Repeated, StepCycle
 from applications.programming.cursor import FAILED, SUCCEEDED, Cursor, Progress
 from applications.programming.files import BadProgram, load_program, path_of
 from applications.programming.flow import Position, Undecided
-from applications.programming.model import BaseStep, Condition, Force, Pick, Python, Target, Wait
+from applications.programming.handling import Pick
+from applications.programming.model import Condition
 from applications.programming.settings import Config
-from applications.programming.stages import Builder, Built, Outlook, ProgramMove, Repeated, StepCycle
+from applications.programming.steps import Python, Wait
 from applications.programming.targets import Cell, NotSeen
 from applications.programming.topics import ProgramStatus
 from common import messages as m
@@ -178,7 +180,7 @@ class ProgramTask(Task[View]):
     def fail(self, message: str, view: View, *, go_home: bool = True) -> None:
         """Repeat the step after a failure, or end it: a program never goes home by itself."""
         self._attempts += 1
-        by_force = bool(self.at.position) and isinstance(self.at.step, Force)  # it began at another place
+        by_force = bool(self.at.position) and self.at.step.ENDS_ANYWHERE  # it began at another place
         if (self._attempts < self.p.attempts and not by_force) or not self.at.position:
             super().fail(message, view, go_home=False)
         else:
@@ -310,7 +312,7 @@ class ProgramTask(Task[View]):
     def _now(self, view: View) -> Outlook:
         """Return what is known at the beginning of the current step: relative motions start where it began first."""
         now, start = Outlook.of(view), self.at.progress.start
-        relative = any(target.by is not None for target in targets_of(self.at.step))
+        relative = any(target.by is not None for _, target in self.at.step.targets())
         return replace(now, T_world_tcp=pose_to_matrix(start)) if relative and start is not None else now
 
     def _append(self, position: Position, before: Outlook, view: View) -> bool:
@@ -346,9 +348,3 @@ class ProgramTask(Task[View]):
 
 def _undecided(condition: Condition) -> bool:
     raise Undecided
-
-
-def targets_of(step: BaseStep) -> list[Target]:
-    """Return the targets of a step."""
-    one = getattr(step, "to", None) or getattr(step, "at", None)
-    return [one] if one is not None else list(getattr(step, "points", ()))

@@ -119,6 +119,8 @@ def test_breakpoints_single_steps_and_a_run_from_a_step_halt_where_they_say(tmp_
 
     async def visit(operator: Operator) -> None:
         await operator.send("breakpoint", program="lift", step="down")
+        with pytest.raises(RemoteError, match="nothing to resume: lift was not started; run it"):
+            await operator.send("resume")
         await operator.send("run")
         assert (await operator.until(lambda status: bool(status.halted))).halted == "breakpoint at down"
         await operator.send("step")
@@ -130,7 +132,8 @@ def test_breakpoints_single_steps_and_a_run_from_a_step_halt_where_they_say(tmp_
         assert (await operator.until(lambda status: status.state == "DONE")).done == 4
         for refused, fields in (("there is no program 'none'", {"command": "run", "program": "none"}),
                                 ("unknown step 'x'", {"command": "run_from", "step": "x"}),
-                                ("there is no step 'x'", {"command": "breakpoint", "step": "x"})):
+                                ("there is no step 'x'", {"command": "breakpoint", "step": "x"}),
+                                ("nothing to resume: lift has ended", {"command": "resume"})):
             with pytest.raises(RemoteError, match=refused):
                 await operator.send(**fields)
         await operator.send("run_from", step="up")
