@@ -7,16 +7,17 @@ lists of steps, which no file may have; every step in it is valid by itself.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
-from applications.programming.model import MOST_STEPS, STEPS, Program, as_data
+from applications.programming.files import new_id
+from applications.programming.model import MOST_STEPS, STEPS, BaseStep, Program, as_data
 from common.config import check
 from common.errors import ConfigError, UnknownName, ZencellError
 
 Data = dict[str, Any]
-Steps = list[Data]
 MAX_UNDO = 100
 MAX_LINE = 500  # characters of a text
 MAX_DEPTH = 10  # levels of nested steps
@@ -32,64 +33,64 @@ class Row:
     """A step in the order of the file.
 
     Attributes:
-        step: its data.
+        path: in the file, such as `steps[2].then[0]`.
+        siblings: list that has the step.
+        index: of the step there.
         depth: number of steps around it.
-        body: field of the step around it that has it, such as `then`; `steps` at the top.
+        body: key of that list, such as `then`; `steps` at the top.
+        around: data of the step with that list; None at the top.
     """
 
-    step: Data
+    path: str
+    siblings: list[Data]
+    index: int
     depth: int
     body: str
+    around: Data | None
+
+    @cached_property
+    def step(self) -> Data:
+        """Its data."""
+        return self.siblings[self.index]
 
     @property
     def id(self) -> str:
         """Its id."""
         return str(self.step["id"])
 
+    @cached_property
+    def words(self) -> str:
+        """What it does in a few words."""
+        return str(parsed(self.step))
+
 
 def bodies(step: Mapping[str, Any]) -> list[str]:
-    """Return the fields of a step that have further steps, as in the file."""
+    """Return the keys of a step's lists of further steps."""
     kind = STEPS[step["step"]]
-    return [kind.model_fields[name].alias or name for name in kind.BODIES]
+    return [key for key, name in kind.keys().items() if name in kind.BODIES]
 
 
-def rows(steps: Sequence[Data], depth: int = 0, body: str = "steps") -> Iterator[Row]:
+def rows(
+    steps: list[Data], depth: int = 0, body: str = "steps", around: Data | None = None, above: str = ""
+) -> Iterator[Row]:
     """Yield all steps, nested ones after the step around them."""
-    for step in steps:
-        yield Row(step, depth, body)
+    for index, step in enumerate(steps):
+        path = f"{above}{body}[{index}]"
+        yield Row(path, steps, index, depth, body, around)
         for name in bodies(step):
-            yield from rows(step.get(name, []), depth + 1, name)
+            yield from rows(step.get(name, []), depth + 1, name, step, f"{path}.")
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a step is: its list, its index in it, and the step around it with the field that has the list."""
-
-    steps: Steps
-    index: int
-    around: Data | None = None
-    body: str = "steps"
-
-
-def find(data: Data, id_: str) -> Place:
-    """Return the place of a step.
+def find(data: Data, id_: str) -> Row:
+    """Return a step.
 
     Raises:
         UnknownName: with the choices.
     """
-    def search(steps: Steps, around: Data | None, body: str) -> Place | None:
-        for index, step in enumerate(steps):
-            if step["id"] == id_:
-                return Place(steps, index, around, body)
-            for name in bodies(step):
-                if found := search(step.get(name, []), step, name):
-                    return found
-        return None
-
-    place = search(data["steps"], None, "steps")
-    if place is None:
-        raise UnknownName("step", id_, [row.id for row in rows(data["steps"])])
-    return place
+    listed = {row.id: row for row in rows(data["steps"])}
+    if id_ not in listed:
+        raise UnknownName("step", id_, listed)
+    return listed[id_]
 
 
 def problems(data: Data) -> dict[str, str]:
@@ -102,49 +103,61 @@ def problems(data: Data) -> dict[str, str]:
     return found
 
 
-# --- edits: each changes the data in place; `Draft` passes a copy ---
+def parsed(step: Mapping[str, Any]) -> BaseStep:
+    """Return a step; nested ones are left out.
+
+    Raises:
+        ConfigError: a field is invalid.
+    """
+    nested = dict.fromkeys(bodies(step), [_VALID])
+    for name, value in step.items():
+        if name not in nested:
+            _require_lines(name, value)
+    return check(STEPS[step["step"]], {**step, **nested})
 
 
-def insert(data: Data, step: Mapping[str, Any], after: str = "", inside: str = "") -> str:
-    """Insert a step; return its id.
+# --- edits: each changes the data in place, and returns the step to choose; `Draft` passes a copy ---
+
+
+def insert(data: Data, after: str, step: Mapping[str, Any], inside: str = "") -> str:
+    """Insert a step.
 
     Args:
         data: of the program.
-        step: its data; ids of it and of nested steps are replaced.
         after: id of the step before it; empty: at the end.
-        inside: field of the step `after` in which it becomes the last step; empty: behind that step.
+        step: its data; ids of it and of nested steps are replaced.
+        inside: list of the step `after` in which it becomes the last step; empty: behind that step.
 
     Raises:
         ConfigError: a field of the step is invalid.
     """
-    new = _with_new_ids(data, copy.deepcopy(dict(step)))
+    new, used = copy.deepcopy(dict(step)), {row.id for row in rows(data["steps"])}
     for row in rows([new]):
-        check_step(row.step)
-    if not after:
+        row.step["id"] = new_id(row.step["step"], used)
+        parsed(row.step)
+    before = find(data, after) if after else None
+    if before is None:
         data["steps"].append(new)
+    elif not inside:
+        before.siblings.insert(before.index + 1, new)
+    elif inside in bodies(before.step):
+        before.step.setdefault(inside, []).append(new)
     else:
-        place = find(data, after)
-        before = place.steps[place.index]
-        if not inside:
-            place.steps.insert(place.index + 1, new)
-        elif inside in bodies(before):
-            before.setdefault(inside, []).append(new)
-        else:
-            raise UnknownName("list of steps", inside, bodies(before))
+        raise UnknownName("list of steps", inside, bodies(before.step))
     _require_room(data)
     return str(new["id"])
 
 
-def delete(data: Data, id_: str) -> None:
+def delete(data: Data, id_: str) -> str:
     """Delete a step and the steps in it."""
-    place = find(data, id_)
-    del place.steps[place.index]
+    ids, row = [row.id for row in rows(data["steps"])], find(data, id_)
+    del row.siblings[row.index]
+    return ids[ids.index(id_) - 1] if ids.index(id_) else ""
 
 
 def duplicate(data: Data, id_: str) -> str:
-    """Insert a copy behind a step; return the id of the copy."""
-    place = find(data, id_)
-    return insert(data, place.steps[place.index], id_)
+    """Insert a copy behind a step."""
+    return insert(data, id_, find(data, id_).step)
 
 
 def move(data: Data, id_: str, by: int) -> None:
@@ -153,30 +166,29 @@ def move(data: Data, id_: str, by: int) -> None:
     Raises:
         EditRefused: it is the first or the last one.
     """
-    place = find(data, id_)
-    step, beyond = place.steps[place.index], place.index + by
-    if 0 <= beyond < len(place.steps):
-        del place.steps[place.index]
-        neighbor = place.steps[beyond - (by > 0)]
-        names = bodies(neighbor)
-        if names:
-            body = neighbor.setdefault(names[0 if by > 0 else -1], [])
-            body.insert(0 if by > 0 else len(body), step)
-        else:
-            place.steps.insert(beyond, step)
-        _require_room(data)
-        return
-    if place.around is None:
+    row = find(data, id_)
+    step, beyond, siblings = row.step, row.index + by, row.siblings
+    into: list[Data] | None = None  # list whose next end it enters
+    if 0 <= beyond < len(siblings):
+        neighbor = siblings[beyond]
+        if names := bodies(neighbor):
+            into = neighbor.setdefault(names[0 if by > 0 else -1], [])
+    elif row.around is None:
         raise EditRefused(f"{id_} is the {'first' if by < 0 else 'last'} step")
-    names = bodies(place.around)
-    number = names.index(place.body) + by
-    del place.steps[place.index]
-    if 0 <= number < len(names):  # into the other list of the same step
-        body = place.around.setdefault(names[number], [])
-        body.insert(0 if by > 0 else len(body), step)
     else:
-        above = find(data, place.around["id"])
-        above.steps.insert(above.index + (by > 0), step)
+        names = bodies(row.around)
+        number = names.index(row.body) + by
+        if 0 <= number < len(names):  # the other list of the same step
+            into = row.around.setdefault(names[number], [])
+        else:
+            above = find(data, row.around["id"])
+            siblings, beyond = above.siblings, above.index + (by > 0)
+    del row.siblings[row.index]
+    if into is None:
+        siblings.insert(beyond, step)
+    else:
+        into.insert(0 if by > 0 else len(into), step)
+    _require_room(data)
 
 
 def set_fields(data: Data, id_: str, values: Mapping[str, Any]) -> None:
@@ -185,54 +197,43 @@ def set_fields(data: Data, id_: str, values: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: names the field, the value and what is expected.
     """
-    place = find(data, id_)
-    step = {name: value for name, value in {**place.steps[place.index], **values}.items() if value is not None}
-    if step["id"] != id_ and any(row.id == step["id"] for row in rows(data["steps"])):
+    row = find(data, id_)
+    step = {name: value for name, value in {**row.step, **values}.items() if value is not None}
+    if step["id"] != id_ and any(each.id == step["id"] for each in rows(data["steps"])):
         raise ConfigError("id", step["id"], "is the id of another step")
-    check_step(step)
-    place.steps[place.index] = step
+    parsed(step)
+    row.siblings[row.index] = step
 
 
-def set_target(data: Data, id_: str, target: Mapping[str, Any]) -> None:
-    """Set the target of a step, in the field of its kind, or add it to the points of a `through`.
+def set_target(data: Data, id_: str, target: Mapping[str, Any], point: int | None = None) -> None:
+    """Set the target of a step; of several the one with a number, or add it to them.
 
     Raises:
         EditRefused: the step has no target.
     """
-    place = find(data, id_)
-    step = place.steps[place.index]
-    name = next((name for name in ("to", "at", "points") if name in STEPS[step["step"]].model_fields), None)
-    if name is None:
+    step = find(data, id_).step
+    name = next((key for key, _ in parsed(step).targets()), "").partition("[")[0]
+    if not name:
         raise EditRefused(f"{id_} is a {step['step']}, which has no target: choose a move, approach, through or place")
-    set_fields(data, id_, {name: [*step.get(name, []), dict(target)] if name == "points" else dict(target)})
+    value: Any = dict(target)
+    if isinstance(points := step[name], list):
+        number = len(points) if point is None else min(point, len(points) - 1)
+        value = [*points[:number], value, *points[number + 1:]]
+    set_fields(data, id_, {name: value})
 
 
-def check_step(step: Mapping[str, Any]) -> None:
-    """Raise ConfigError if a field of a step is invalid; nested steps do not count."""
-    for name, value in step.items():
-        if name not in bodies(step):
-            _require_lines(name, value)
-    shell = {name: [_VALID] if name in bodies(step) else value for name, value in step.items()}
-    check(STEPS[step["step"]], {**{name: [_VALID] for name in bodies(step)}, **shell})
+def remove_point(data: Data, id_: str, number: int) -> None:
+    """Remove one of several targets."""
+    points = find(data, id_).step["points"]
+    set_fields(data, id_, {"points": [*points[:number], *points[number + 1:]]})
 
 
 def _require_lines(name: str, value: Any) -> None:
     """Raise ConfigError for a text that a list of steps cannot show on one line."""
     if isinstance(value, str) and (len(value) > MAX_LINE or not value.isprintable()):
         raise ConfigError(name, value[:40], f"must be one line of at most {MAX_LINE} characters")
-    for each in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
-        _require_lines(name, list(each) if isinstance(value, dict) else each[1])
-
-
-def _with_new_ids(data: Data, step: Data) -> Data:
-    used = {row.id for row in rows(data["steps"])}
-    for row in rows([step]):
-        number = 1
-        while (id_ := f"{row.step['step']}{number}") in used:
-            number += 1
-        row.step["id"] = id_
-        used.add(id_)
-    return step
+    for each in [*value, *value.values()] if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _require_lines(name, each)
 
 
 def _require_room(data: Data) -> None:
@@ -261,6 +262,7 @@ class Draft:
     revision: str = ""
     _saved: Data | None = None
     _past: list[tuple[str, Data]] = field(default_factory=list)
+    _listed: tuple[Data | None, list[Row]] = (None, [])
 
     @classmethod
     def of(cls, name: str, program: Program, revision: str) -> Draft:
@@ -281,21 +283,18 @@ class Draft:
     @property
     def rows(self) -> list[Row]:
         """All steps in the order of the file."""
-        return list(rows(self.data["steps"]))
+        if self._listed[0] is not self.data:
+            self._listed = self.data, list(rows(self.data["steps"]))
+        return self._listed[1]
 
     def step(self, id_: str) -> Data | None:
         """Return the data of a step; None without one of this id."""
         return next((row.step for row in self.rows if row.id == id_), None)
 
-    def edit(self, text: str, change: Callable[[Data], Any]) -> Any:
-        """Make an edit, all of it or nothing; return what `change` returns.
-
-        Args:
-            text: for `undoes`.
-            change: changes the data that it gets, or raises.
-        """
+    def edit(self, text: str, change: Callable[..., Any], *values: Any) -> Any:
+        """Make an edit, all of it or nothing; return what `change(data, *values)` returns; `text` is for `undoes`."""
         data = copy.deepcopy(self.data)
-        result = change(data)
+        result = change(data, *values)
         if data != self.data:
             self._push(text, data)
         return result

@@ -151,10 +151,6 @@ class ProgramEditor:
             draft, text = self._draft_text()
             self._note_problems(draft, await self._request("check", draft.name, text))
 
-    def text(self) -> str:
-        """Return the draft as the YAML of its file."""
-        return self._draft_text()[1]
-
     def _draft_text(self) -> tuple[Draft, str]:
         draft = self._required()
         if self.incomplete:
@@ -187,51 +183,24 @@ class ProgramEditor:
         """Choose a step."""
         self.chosen, self.point = id_, point
 
-    def edit(self, text: str, change: Callable[..., Any], *values: Any) -> Any:
-        """Make an edit; return what `change(data, *values)` returns."""
+    def edit(self, text: str, change: Callable[..., str | None], *values: Any) -> None:
+        """Make an edit of editing.py, and choose the step that it returns."""
         self._deletion = ""
-        return self._required().edit(text, lambda data: change(data, *values))
+        chosen = self._required().edit(text, change, *values)
+        if chosen is not None:
+            self.choose(chosen)
 
     def add(self, kind: str, after: str, inside: str = "") -> None:
         """Add a step of a kind below another one, or in its list of steps, and choose it."""
-        self._insert(f"add {kind}", new_step(kind, self._known()), after, inside)
+        self.edit(f"add {kind}", editing.insert, after, new_step(kind, self._known()), inside)
 
     def add_here(self, after: str, *, tool: bool = False) -> None:
         """Add a motion to the present pose, by its joint positions or by the pose of the tool."""
-        self._insert("add move", {"step": "move", "to": self._known().here(tool=tool)}, after, "")
-
-    def _insert(self, text: str, step: Data, after: str, inside: str) -> None:
-        self.choose(self.edit(text, editing.insert, step, after, inside))
-
-    def duplicate(self, id_: str) -> None:
-        """Insert a copy below a step and choose it."""
-        self.choose(self.edit(f"duplicate {id_}", editing.duplicate, id_))
-
-    def remove(self, id_: str) -> None:
-        """Delete a step and choose the one that was above it."""
-        ids = [row.id for row in self._required().rows]
-        self.edit(f"delete {id_}", editing.delete, id_)
-        self.choose(ids[max(ids.index(id_) - 1, 0)] if ids.index(id_) else "")
-
-    def move(self, id_: str, by: int) -> None:
-        """Move a step up or down."""
-        self.edit(f"move {id_}", editing.move, id_, by)
+        self.edit("add move", editing.insert, after, {"step": "move", "to": self._known().here(tool=tool)})
 
     def use_present_pose(self, id_: str, *, add: bool = False) -> None:
-        """Make the present joint positions the target of a step; of a `through`, one of its points."""
-        here, step = self._known().here(), self._required().step(id_)
-        if step is not None and "points" in step and not add:
-            points = [*step["points"]]
-            points[min(self.point, len(points) - 1)] = here
-            self.edit(f"change {id_}", editing.set_fields, id_, {"points": points})
-        else:
-            self.edit(f"change {id_}", editing.set_target, id_, here)
-
-    def remove_point(self, id_: str, number: int) -> None:
-        """Remove a point of a `through`."""
-        step = self._required().step(id_)
-        points = [each for index, each in enumerate((step or {}).get("points", [])) if index != number]
-        self.edit(f"change {id_}", editing.set_fields, id_, {"points": points})
+        """Make the present joint positions the target of a step; of several the chosen one, unless they are added."""
+        self.edit(f"change {id_}", editing.set_target, id_, self._known().here(), None if add else self.point)
 
     def apply(self, id_: str, field: FormField, shown: Any) -> None:
         """Set a field of a step to a displayed value.
@@ -295,20 +264,10 @@ def problems_by_step(draft: Draft, problems: list[str]) -> dict[str, str]:
 
     A line names the path of the step in the file, or its id between colons or parentheses.
     """
-    ids, found = _ids_by_path(draft.data["steps"], "steps"), dict[str, str]()
+    ids, found = {row.path: row.id for row in draft.rows}, dict[str, str]()
     for problem in problems:
         path = _PATH.search(problem)
         id_ = ids.get(path[0], "") if path else next(
             (id_ for id_ in ids.values() if re.search(rf"[:(] ?{re.escape(id_)}[:)]", problem)), "")
         found.setdefault(id_, problem)
-    return found
-
-
-def _ids_by_path(steps: list[Data], above: str) -> dict[str, str]:
-    found = {}
-    for number, step in enumerate(steps):
-        path = f"{above}[{number}]"
-        found[path] = step["id"]
-        for name in editing.bodies(step):
-            found |= _ids_by_path(step.get(name, []), f"{path}.{name}")
     return found

@@ -14,22 +14,17 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from applications.programming.editing import Data, EditRefused, bodies
-from applications.programming.model import STEPS, Condition, Target
+from applications.programming.model import STEPS, BaseStep, Condition, Part, Target
 from common.config import parse_yaml
 from common.errors import ConfigError
 
 DEGREE = 180 / math.pi
-MM, DEGREES, PERCENT = (1e3, "mm"), (DEGREE, "°"), (100.0, "%")
-UNITS = {  # of fields: displayed per stored value, and the unit that is displayed
-    **dict.fromkeys((
-        "distance", "width", "blend", "expected_width", "width_tolerance", "position", "by", "height", "item", "gap",
-        "pitch", "sheet", "pallet", "robot", "depth", "max_distance"), MM), "tool_speed": (1e3, "mm/s"),
-    **dict.fromkeys(("rpy", "turn", "yaw"), DEGREES), "speed": PERCENT,
-    "seconds": (1.0, "s"), "timeout": (1.0, "s"), "force": (1.0, "N"), "mass": (1.0, "kg"),
-}
-LABELS = {"rpy": "Roll, pitch, yaw", "by": "Displacement", "name": "Pose"}
+UNITS = {  # by that of the file: displayed per stored value, and the unit that is displayed
+    "m": (1e3, "mm"), "m/s": (1e3, "mm/s"), "rad": (DEGREE, "°"), "s": (1.0, "s"), "N": (1.0, "N"), "kg": (1.0, "kg")}
+LABELS = {"rpy": "Roll, pitch, yaw", "by": "Displacement", "name": "Pose", "wait": "Wait for", "loop": "Repeat"}
 COMMON = ("id", "note", "on_failure", "speed", "touch", "requires")  # rarely changed, listed last
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)e[+-]?\d{1,3}", re.IGNORECASE)  # which is a text in YAML
 ZERO = [0.0, 0.0, 0.0]
@@ -122,117 +117,104 @@ class FormField:
 
 
 def fields_of(step: Data, known: Known, point: int = 0) -> list[FormField]:
-    """Return the form of a step; of the points of a `through`, that with the number `point` is shown."""
+    """Return the form of a step; of several points, that with the number `point` is shown."""
     kind = STEPS[step["step"]]
-    found = _alternatives(step, known, (), _STEP_ALTERNATIVES.get(step["step"], {}))
-    hidden = _hidden(step, _STEP_ALTERNATIVES.get(step["step"], {}))
-    for name, info in sorted(kind.model_fields.items(), key=lambda each: each[0] in COMMON):
-        alias = info.alias or name
-        if alias in ("step", *bodies(step), *hidden):
+    found, hidden = _alternatives(kind, step, known, ()), {"step", *bodies(step), *_hidden(kind, step)}
+    for key, name in sorted(kind.keys().items(), key=lambda each: each[0] in COMMON):
+        info, value = kind.model_fields[name], step.get(key)
+        part = _part_in(info.annotation)
+        if key in hidden:
             continue
-        inner = _part_in(info.annotation)
-        if inner is None:
-            found.append(_field(kind, name, (alias,), step.get(alias), known))
-        elif alias == "points":
-            number = min(point, len(step["points"]) - 1)
-            found += _part_fields(inner, (alias, number), step["points"][number], known)
-        elif step.get(alias) is not None or inner not in (Target, Condition):
-            found += _part_fields(inner, (alias,), step.get(alias, {}), known)
+        if part is None:
+            found.append(_field(info, key, (key,), value, known))
+        elif isinstance(value, list):
+            number = min(point, len(value) - 1)
+            found += _part_fields(part, (key, number), value[number], known)
+        elif value is not None or not issubclass(part, Part):
+            found += _part_fields(part, (key,), value or {}, known)
     return found
 
 
 def new_step(kind: str, known: Known) -> Data:
-    """Return the data of a new step.
+    """Return the data of a new step: its required fields, and the first of its alternatives.
 
     Raises:
         EditRefused: the cell has nothing that such a step needs.
-        UnknownName: there is no such kind.
     """
-    here = known.here
-    made: dict[str, Callable[[], Data]] = {
-        "move": lambda: {"to": here()}, "through": lambda: {"points": [here()]}, "approach": lambda: {"to": here()},
-        "grip": lambda: {"width": "open"}, "wait": lambda: {"seconds": 1.0}, "loop": lambda: {"count": 2, "steps": []},
-        "output": lambda: {"signal": _first(known.outputs, "outputs")}, "place": lambda: {"at": here(tool=True)},
-        "if": lambda: {"when": {"signal": known.signals[0]} if known.signals else {"holding": True}, "then": []},
-        "call": lambda: {"program": _first(known.programs, "other programs")},
-        "until": lambda: {"force": 5.0}, "insert": lambda: {"depth": 0.02},
-        "palletize": lambda: {"pattern": {"item": [0.05, 0.05, 0.05], "columns": 2}, "steps": []},
-        "python": lambda: {"function": "module:function"},
-    }
-    return {"step": kind, **made.get(kind, dict)()}
+    model, made = STEPS[kind], {"step": kind}
+    keys = [key for key, name in model.keys().items() if model.model_fields[name].is_required()]
+    for key in [*keys, *next(iter(model.ONE_OF.values()), ())[:1]]:
+        made |= _first(model, key, known)
+    return made
 
 
-def _first(names: Sequence[str], what: str) -> str:
-    if not names:
-        raise EditRefused(f"this cell has no {what}")
-    return names[0]
+def _first(kind: type[Part], key: str, known: Known) -> Data:
+    """Return the first value of a field: a name that exists, the present pose, its example, or an empty list."""
+    info = kind.model_fields[kind.keys()[key]]
+    outputs = issubclass(kind, BaseStep)
+    names = {"name": (known.poses, "named poses"), "program": (known.programs, "other programs"),
+             "signal": (known.outputs if outputs else known.signals, "outputs" if outputs else "signals")}
+    if key in names:
+        choices, what = names[key]
+        if not choices:
+            raise EditRefused(f"this cell has no {what}")
+        return {key: choices[0]}
+    if kind is Target and key in ("joints", "position"):
+        return known.here(tool=key == "position")
+    if info.examples:
+        return {key: info.examples[0]}
+    part = _part_in(info.annotation)
+    if part is Target:
+        here = known.here(tool=key == "at")
+        return {key: [here] if get_origin(info.annotation) is list else here}
+    if part is Condition:
+        return {key: {"signal": known.signals[0]} if known.signals else {"holding": True}}
+    return {key: []}
 
 
 # --- alternatives: of each exactly one is given ---
 
-# The fields of each alternative, and the values of the first ones when it is chosen.
-Alternatives = Mapping[str, tuple[tuple[str, ...], Callable[[Known], Data]]]
-_STEP_ALTERNATIVES: dict[str, Alternatives] = {
-    "wait": {"a time": (("seconds",), lambda _: {"seconds": 1.0}),
-             "a signal": (("for", "timeout"), lambda known: {"for": {"signal": _first(known.signals, "signals")}})},
-    "loop": {"a number of times": (("count",), lambda _: {"count": 2}),
-             "while a condition holds": (("while",), lambda _: {"while": {"holding": True}}),
-             "without end": ((), lambda _: {})},
-}
-_TARGET: Alternatives = {
-    "named pose": (("name",), lambda known: {"name": _first(known.poses, "named poses")}),
-    "joint positions": (("joints",), lambda known: known.here()),
-    "tool pose": (("position", "rpy"), lambda known: known.here(tool=True)),
-    "displacement": (("by", "turn", "frame"), lambda _: {"by": [0.0, 0.0, 0.05]}),
-}
-_CONDITION: Alternatives = {
-    "signal": (("signal", "value", "above", "below"), lambda known: {"signal": _first(known.signals, "signals")}),
-    "gripper holds": (("holding",), lambda _: {"holding": True}),
-    "outcome of the step before": (("outcome",), lambda _: {"outcome": "succeeded"}),
-}
+
+def _current(kind: Any, data: Mapping[str, Any]) -> str:
+    """Return the label of the alternative that is given; empty for a part without alternatives."""
+    some: Mapping[str, tuple[str, ...]] = getattr(kind, "ONE_OF", {})
+    return next((label for label, keys in some.items() if keys and keys[0] in data), list(some)[-1] if some else "")
 
 
-def _current(data: Mapping[str, Any], some: Alternatives) -> str:
-    return next((name for name, (fields, _) in some.items() if fields and fields[0] in data), list(some)[-1])
+def _hidden(kind: type[Part], data: Mapping[str, Any]) -> list[str]:
+    current = _current(kind, data)
+    return [key for label, keys in kind.ONE_OF.items() if label != current for key in keys]
 
 
-def _hidden(data: Mapping[str, Any], some: Alternatives) -> list[str]:
-    if not some:
+def _alternatives(kind: Any, data: Mapping[str, Any], known: Known, path: Path) -> list[FormField]:
+    if not (current := _current(kind, data)):
         return []
-    shown = some[_current(data, some)][0]
-    return [name for fields, _ in some.values() for name in fields if name not in shown]
-
-
-def _alternatives(data: Mapping[str, Any], known: Known, path: Path, some: Alternatives) -> list[FormField]:
-    if not some:
-        return []
+    some: Mapping[str, tuple[str, ...]] = kind.ONE_OF
 
     def parse(chosen: str) -> Data:
-        new = some[chosen][1](known) if chosen in some else {}
-        return {name: new.get(name) for fields, _ in some.values() for name in fields} if not path else new
+        new = _first(kind, keys[0], known) if (keys := some.get(chosen, ())) else {}
+        return new if path else {name: new.get(name) for fields in some.values() for name in fields}
 
-    name = "Repeat" if "steps" in data else "Wait for"
-    if path:
-        name = f"Point {int(path[1]) + 1}" if path[0] == "points" else str(path[0]).capitalize()
-    return [FormField(path, name, "choice", _current(data, some), "which of these is given", parse, list(some))]
+    label = f"Point {int(path[1]) + 1}" if path[1:] else str(path[0] if path else data["step"])
+    return [FormField(path, LABELS.get(label, label.capitalize()), "choice", current, "which of these is given", parse,
+                      list(some))]
 
 
 def _part_fields(kind: type[BaseModel], path: Path, data: Any, known: Known) -> list[FormField]:
     """Return the fields of a target, a condition or another part."""
     data = {"name": data} if isinstance(data, str) else data
-    some = _TARGET if kind is Target else _CONDITION if kind is Condition else {}
-    names = some[_current(data, some)][0] if some else kind.model_fields
-    return [*_alternatives(data, known, path, some),
-            *(_field(kind, name, (*path, name), data.get(name), known) for name in names)]
+    names = kind.ONE_OF[_current(kind, data)] if issubclass(kind, Part) else kind.model_fields
+    return [*_alternatives(kind, data, known, path),
+            *(_field(kind.model_fields[name], name, (*path, name), data.get(name), known) for name in names)]
 
 
 # --- single values ---
 
 
-def _field(kind: type[BaseModel], name: str, path: Path, value: Any, known: Known) -> FormField:
-    info = kind.model_fields[name]
+def _field(info: FieldInfo, name: str, path: Path, value: Any, known: Known) -> FormField:
     default = None if info.is_required() else info.get_default(call_default_factory=True)
-    scale, unit = UNITS.get(name, (1.0, ""))
+    described = re.search(r"\[([^]]*)\]", info.description or "")
+    scale, unit = (100.0, "%") if name == "speed" else UNITS.get(described[1] if described else "", (1.0, ""))
     label = " ".join([LABELS.get(name, name.replace("_", " ").capitalize()), *([f"[{unit}]"] if unit else [])])
     hint = re.sub(r" *\[[^]]*\]", "", info.description or "").lstrip("; ")  # the unit of the file
     choices = {"name": known.poses, "signal": known.outputs if path == ("signal",) else known.signals,
@@ -255,7 +237,7 @@ def _field(kind: type[BaseModel], name: str, path: Path, value: Any, known: Know
             scales = list(known.scales) if len(known.scales) == len(values) else [DEGREE] * len(values)
         shown = ", ".join(f"{round(scale * each, 3):g}" for scale, each in zip(scales, values, strict=bool(values)))
         return FormField(path, label, "text", shown, hint, partial(_numbers, name, scales))
-    is_text = info.annotation is str or name in ("signal", "program", "function")
+    is_text = info.annotation is str
     brackets = {list: "[]", dict: "{}"}.get(get_origin(info.annotation) or str, "")
     shown = "" if given in (None, [], {}) else _text(given, scale)
     if not info.is_required() and default not in (None, "", [], {}):

@@ -152,7 +152,7 @@ class ProgramPanel:
     def _show_orders(self, status: ProgramStatus | None) -> None:
         editor, draft, step, id_ = self.editor, self.editor.draft, self.editor.step, self.editor.chosen
         closed = "" if draft is not None else "open a program first"
-        kind, button = self._kind, self._button
+        kind, button, edit = self._kind, self._button, self.editor.edit
         rows = buttons(
             button(f"Add {kind}", f"add:{kind}:{id_}", partial(editor.add, kind, id_), closed),
             *(button(f"Add {kind} in {name}", f"add:{kind}:{id_}:{name}", partial(editor.add, kind, id_, name))
@@ -162,10 +162,10 @@ class ProgramPanel:
         if step is not None and draft is not None:
             stops = status is not None and status.program == draft.name and id_ in status.breakpoints
             rows += buttons(
-                button("↑ Up", f"up:{id_}", partial(editor.move, id_, -1)),
-                button("↓ Down", f"down:{id_}", partial(editor.move, id_, 1)),
-                button("Duplicate", f"duplicate:{id_}", partial(editor.duplicate, id_)),
-                button("Delete step", f"remove:{id_}", partial(editor.remove, id_)))
+                button("↑ Up", f"up:{id_}", partial(edit, f"move {id_}", editing.move, id_, -1)),
+                button("↓ Down", f"down:{id_}", partial(edit, f"move {id_}", editing.move, id_, 1)),
+                button("Duplicate", f"duplicate:{id_}", partial(edit, f"duplicate {id_}", editing.duplicate, id_)),
+                button("Delete step", f"remove:{id_}", partial(edit, f"delete {id_}", editing.delete, id_)))
             rows += buttons(
                 button("Use present pose", f"present:{id_}", partial(editor.use_present_pose, id_)),
                 button("Remove breakpoint" if stops else "Breakpoint", f"breakpoint:{id_}:{not stops}",
@@ -176,7 +176,8 @@ class ProgramPanel:
                     *(button(f"{number + 1}", f"point:{id_}:{number}", partial(editor.choose, id_, number),
                              main=number == at) for number in range(len(points))),
                     button("Add present pose", f"point:{id_}:add", partial(editor.use_present_pose, id_, add=True)),
-                    button("Remove", f"unpoint:{id_}:{at}", partial(editor.remove_point, id_, at)), label="Points")
+                    button("Remove", f"unpoint:{id_}:{at}", partial(
+                        edit, f"change {id_}", editing.remove_point, id_, at)), label="Points")
         self._orders.set(block(rows, "step orders", chosen=id_))
 
     def _button(

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 
 from applications.programming.editing import Draft
 from applications.programming.topics import ProgramStatus
-from applications.programming.wording import summary
 from page.markup import block, line, press, row, span, table, text
 
 CURRENT, BREAKPOINT = "▶", "●"
@@ -31,7 +30,7 @@ def list_of_steps(draft: Draft | None, status: ProgramStatus | None, problems: M
     for number, each in enumerate(draft.rows, 1):
         marks = (span(CURRENT, "good") if each.id == current else "") + (
             span(BREAKPOINT, "bad") if each.id in stops else "")
-        label = "│ " * each.depth + ("else: " if each.body == "else" else "") + summary(each.step)
+        label = "│ " * each.depth + ("else: " if each.body == "else" else "") + each.words
         why = problems.get(each.id) or failed.get(each.id, "")
         note = str(each.step.get("note", ""))
         below = (f'<div class="dim">{text(note)}</div>' if note else "") + (line(why, "bad") if why else "")

@@ -10,7 +10,6 @@ from applications.programming import editing
 from applications.programming.editing import EditRefused
 from applications.programming.form import Known, fields_of, new_step
 from applications.programming.model import STEPS
-from applications.programming.wording import summary
 from common.errors import ConfigError
 
 KNOWN = Known(poses=["home", "bin"], signals=["door", "clamp"], outputs=["clamp"], programs=["other"],
@@ -28,12 +27,11 @@ def labels(step: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize("kind", STEPS)
 def test_every_kind_of_step_starts_valid_and_its_shown_values_are_its_values(kind: str) -> None:
     step = made(kind)
-    editing.check_step(step)
-    assert summary(step)
+    assert str(editing.parsed(step))
     shown = {each.path: each.shown for each in fields_of(step, KNOWN)}
     for each in fields_of(step, KNOWN):
         again = {name: value for name, value in {**step, **each.values(step, each.shown)}.items() if value is not None}
-        editing.check_step(again)
+        editing.parsed(again)
         assert {other.path: other.shown for other in fields_of(again, KNOWN)} == shown, each.label
 
 
@@ -67,7 +65,7 @@ def test_entered_value_becomes_the_value_of_the_file(
     (field,) = [each for each in fields_of({**step, "id": "one"}, KNOWN) if each.label == label]
     values = field.values(step, entered)
     assert values == expected
-    editing.check_step({name: value for name, value in {**step, "id": "one", **values}.items() if value is not None})
+    editing.parsed({name: value for name, value in {**step, "id": "one", **values}.items() if value is not None})
 
 
 @pytest.mark.parametrize(("kind", "label", "entered", "reason"), [

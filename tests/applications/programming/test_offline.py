@@ -125,9 +125,9 @@ steps:
     assert (done.returncode, done.stderr) == (0, "")
     names = {node.name for node in ast.walk(ast.parse(done.stdout)) if isinstance(node, ast.FunctionDef)}
     assert names == {"program", "part"}
-    for line in ("    time.sleep(1)", "        outcome = call(measure, 10, size=2)",
-                 "        pick(cell, closing_axis='y', approach=0.1, lowest=0.012, kind='ball', "
-                 "outside=[pattern_palletize1])", "        part(cell)"):
+    for line in ("    do.wait(seconds=1.0)", "    do.grip(width='open', holds=False)",
+                 "    do.python(on_failure='continue', function='functions_of_an_export:measure', ",
+                 "        do.pick(kind='ball')", "        do.outcome = part(cell)"):
         assert line in done.stdout, line
 
 
