@@ -35,6 +35,7 @@ class Cursor:
         """Start without a program."""
         self.status = status
         self.flow: Flow | None = None
+        self.ids: set[str] = set()  # of all steps
         self.position: Position = ()
         self.in_step = False  # whether the step there has started
         self.repeated = False  # whether it was interrupted before
@@ -78,9 +79,9 @@ class Cursor:
             BadProgram: it, or a program that it calls, is invalid or missing.
         """
         self.flow = Flow(load_all(file), file.name)
-        known = {step for each in self.flow.files.values() for step in each.steps}
+        self.ids = {step for each in self.flow.files.values() for step in each.steps}
         status = self.status
-        status.program, status.breakpoints = file.name, [each for each in status.breakpoints if each in known]
+        status.program, status.breakpoints = file.name, [each for each in status.breakpoints if each in self.ids]
         self.restart()
 
     def restart(self, id_: str = "") -> None:

@@ -109,7 +109,7 @@ def parsed(step: Mapping[str, Any]) -> BaseStep:
     Raises:
         ConfigError: a field is invalid.
     """
-    nested = dict.fromkeys(bodies(step), [_VALID])
+    nested = {key: [_VALID] for key in bodies(step)}
     for name, value in step.items():
         if name not in nested:
             _require_lines(name, value)

@@ -46,7 +46,7 @@ MOST_STEPS = 1000
 
 
 def _error(kind: str, text: str, choices: Sequence[str], key: str, value: Any) -> InitErrorDetails:
-    return {"type": PydanticCustomError(kind, f"{text}; choices: {', '.join(choices)}"),  # type: ignore[arg-type]
+    return {"type": PydanticCustomError(kind, f"{text}; choices: {', '.join(choices)}"),
             "loc": (key,), "input": value}
 
 

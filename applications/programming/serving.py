@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from applications.programming.cursor import Progress
 from applications.programming.files import (
     BadProgram,
+    ProgramFile,
     load_all,
     load_program,
     names_in,
@@ -56,7 +58,7 @@ class ProgramMemory(TaskMemory):
         super().__init__(bus, task)
         self._program = task
         self._lasting = AtomicFile(Path(task.p.progress), Progress) if task.p.progress else None
-        self.written = asyncio.Event()
+        self.on_write: Callable[[], None] = lambda: None
 
     async def load(self) -> None:
         """Restore the progress of the process before, or of the cell before."""
@@ -78,7 +80,7 @@ class ProgramMemory(TaskMemory):
         if self._lasting is not None:
             await asyncio.to_thread(self._lasting.save, self._saved)
         self._program.at.persisted = self._saved
-        self.written.set()
+        self.on_write()
 
 
 class ProgramRunner(TaskRunner[View]):
@@ -93,6 +95,8 @@ class ProgramRunner(TaskRunner[View]):
         self._editing = asyncio.Lock()  # between the check of a revision and the write
         self._wanted: tuple[ProgramCommand, Flow] | None = None
         self._rehearse = asyncio.Event()
+        if isinstance(self._memory, ProgramMemory):
+            self._memory.on_write = self._woken.set
         bus.serve(PROGRAM_COMMAND, self._command)
         bus.serve(PROGRAM_EDIT, self._edit)
 
@@ -107,20 +111,12 @@ class ProgramRunner(TaskRunner[View]):
         async with asyncio.TaskGroup() as group:
             group.create_task(self._call_functions())
             group.create_task(self._rehearse_programs())
-            if isinstance(self._memory, ProgramMemory):
-                group.create_task(self._wake_on_write(self._memory))
             await super().run(readers)
 
     def _publish(self) -> None:
         if self._program.call is not None:
             self._called.set()
         super()._publish()
-
-    async def _wake_on_write(self, memory: ProgramMemory) -> None:
-        while True:
-            await memory.written.wait()
-            memory.written.clear()
-            self._woken.set()
 
     # --- functions of the user --------------------------------------------------------------------------------------
 
@@ -135,15 +131,14 @@ class ProgramRunner(TaskRunner[View]):
             while not running.done() and self._program.call is call:
                 await asyncio.wait({running}, timeout=0.1)
             if running.done():
-                self._program.on_result(call.number, *running.result())
+                self._program.on_result(call, *running.result())
             running.cancel()
             self._woken.set()
 
     # --- commands -------------------------------------------------------------------------------------------------
 
     async def _command(self, request: ProgramCommand) -> ProgramStatus:
-        task, status = self._program, self._program.status
-        try:
+        with _refusals():
             if request.command in ("pause", "stop"):
                 await self._obey(m.TaskCommand(command=request.command, by=request.by))
             elif request.command == "breakpoint":
@@ -152,19 +147,15 @@ class ProgramRunner(TaskRunner[View]):
                 self._begin_rehearsal(request)
             else:
                 await self._run_program(request)
-        except (Refused, RequestFailed):
-            raise
-        except ZencellError as error:
-            raise Refused("bad_program", str(error)) from None
         self._woken.set()
-        return status.model_copy(update={"header": self._bus.header()}, deep=True) if task else status
+        return self._program.status.model_copy(update={"header": self._bus.header()}, deep=True)
 
     async def _run_program(self, request: ProgramCommand) -> None:
         task, status = self._program, self._program.status
-        view = self._look()
-        if request.command == "resume" and not (status.halted or (status.started and status.state != "DONE")):
+        view, ended = self._look(), status.state == "DONE"
+        if request.command == "resume" and not (status.halted or (status.started and not ended)):
             raise Refused("not_started", f"there is nothing to resume: {status.program or 'a program'} "
-                          f"{'has ended' if status.state == 'DONE' else 'was not started'}; run it")
+                          f"{'has ended' if ended else 'was not started'}; run it")
         continues = request.command == "resume" or (
             request.command == "step" and not request.step and request.program in ("", status.program)
             and bool(task.at.position))
@@ -173,65 +164,53 @@ class ProgramRunner(TaskRunner[View]):
                               acknowledged=request.acknowledged)
         require_allowed(asked, view.motion if view else None, self._owner.latest)
         if not continues:
-            if task.is_active:
-                raise Refused("busy", f"{status.program} is at step {status.step}: stop it first")
+            self._require_idle("stop it first")
             if request.command == "run_from" and not request.step:
                 raise Refused("bad_program", "run_from needs the id of a step")
-            self._load(request.program)
+            task.at.load(self._file(request.program))
             task.go_to(request.step)
         elif task.at.flow is None:
             raise Refused("bad_program", "no program is loaded: name one")
         task.proceed(single=request.command == "step")
         await self._obey(asked)
 
-    def _load(self, program: str) -> None:
-        """Load a program from its file, by default the loaded one."""
+    def _file(self, program: str) -> ProgramFile:
+        """Read a program, by default the loaded one."""
         at = self._program.at
-        if program and program != self._program.status.program:
-            _require_name(program)
-            path = path_of(self.folder, program)
-            if not path.is_file():
-                raise Refused("bad_program", f"there is no program {program!r} in {self.folder}; choices: "
-                              f"{', '.join(names_in(self.folder)) or 'none'}")
-        else:
-            path = at.program.files[at.program.main].path
-        at.load(load_program(path))
+        if not program or program == self._program.status.program:
+            return load_program(at.program.files[at.program.main].path)
+        path = path_of(self.folder, _checked(program))
+        if not path.is_file():
+            raise Refused("bad_program", f"there is no program {program!r} in {self.folder}; choices: "
+                          f"{', '.join(names_in(self.folder)) or 'none'}")
+        return load_program(path)
+
+    def _require_idle(self, what: str) -> None:
+        if self._program.is_active:
+            raise Refused("busy", f"{self._program.status.program} is at step {self._program.status.step}: {what}")
 
     def _set_breakpoint(self, request: ProgramCommand) -> None:
         at, status = self._program.at, self._program.status
-
-        def find() -> set[str]:
-            return {step for each in at.program.files.values() for step in each.steps}
-
-        known = find() if at.flow is not None else set()
         name = request.program or status.program
-        if name and (name != status.program or request.step not in known):  # the file may have steps since then
+        if name and (name != status.program or request.step not in at.ids):  # the file may have steps since then
             if self._program.is_active or status.halted:
                 raise Refused("busy", f"{status.program} is at step {status.step}, as it was loaded: stop it before "
                               f"you set a breakpoint at {request.step}")
-            self._load(name)
-            known = find()
-        if request.step not in known:
-            raise Refused("bad_program", f"there is no step {request.step!r}; choices: {', '.join(sorted(known))}")
+            at.load(self._file(name))
+        if request.step not in at.ids:
+            raise Refused("bad_program", f"there is no step {request.step!r}; choices: {', '.join(sorted(at.ids))}")
         others = [each for each in status.breakpoints if each != request.step]
         status.breakpoints = [*others, request.step] if request.enabled else others
 
     # --- dry run --------------------------------------------------------------------------------------------------
 
     def _begin_rehearsal(self, request: ProgramCommand) -> None:
-        at, status = self._program.at, self._program.status
-        if self._program.is_active:
-            raise Refused("busy", f"{status.program} is at step {status.step}: a dry run starts at standstill")
-        if request.program or at.flow is not None:
-            name = request.program or status.program
-            path = path_of(self.folder, name) if name != status.program else at.program.files[at.program.main].path
-            file = load_program(path)
-        else:
-            raise Refused("bad_program", "no program is loaded: name one")
+        self._require_idle("a dry run starts at standstill")
+        file = self._file(request.program)
         flow = Flow(load_all(file), file.name)
         if request.step:
             flow.find(request.step)
-        status.rehearsal = Rehearsal(program=file.name, state="running")
+        self._program.status.rehearsal = Rehearsal(program=file.name, state="running")
         self._wanted = request, flow
         self._rehearse.set()
 
@@ -281,24 +260,18 @@ class ProgramRunner(TaskRunner[View]):
         reply = ProgramContent(header=self._bus.header(), program=request.program, text=request.text,
                                signals=list(task.p.io.signals), poses=sorted({
                                    *task.p.robot.named_poses, *task.cell.saved().poses}))
-        try:
-            if request.act != "list":
-                _require_name(request.program)
-                async with self._editing:
-                    await asyncio.to_thread(self._apply, request, reply)
-        except BadProgram as error:
-            reply.problems = error.problems[:200]
-        except Refused:
-            raise
-        except OSError as error:
-            raise Refused("not_saved", f"{error.filename}: {error.strerror}") from None
-        except ZencellError as error:
-            raise Refused("bad_program", str(error)) from None
+        with _refusals():
+            try:
+                if request.act != "list":
+                    async with self._editing:
+                        await asyncio.to_thread(self._apply, request, reply)
+            except BadProgram as error:
+                reply.problems = error.problems[:200]
         reply.programs = names_in(self.folder)
         return reply
 
     def _apply(self, request: ProgramEdit, reply: ProgramContent) -> None:
-        path = path_of(self.folder, request.program)
+        path = path_of(self.folder, _checked(request.program))
         if request.act == "load":
             reply.text = text_of(load_program(path).program)
             reply.revision = revision_of(path)
@@ -307,8 +280,8 @@ class ProgramRunner(TaskRunner[View]):
             raise Refused("changed", f"{request.program} was changed elsewhere: its file is of revision "
                           f"{revision or 'none'}, the request is for {request.revision or 'none'}; load it again")
         if request.act == "delete":
-            if self._program.is_active and request.program == self._program.status.program:
-                raise Refused("busy", f"{request.program} runs: stop it first")
+            if request.program == self._program.status.program:
+                self._require_idle("stop it first")
             path.unlink(missing_ok=True)
             return
         file = parse_program(request.text, path)
@@ -323,8 +296,20 @@ class ProgramRunner(TaskRunner[View]):
         reply.problems = found[:200]
 
 
-def _require_name(program: str) -> None:
+def _checked(program: str) -> str:
     if not NAME.fullmatch(program):
         raise Refused("bad_program", f"{program!r} is no name of a program: letters, digits, _ and -")
+    return program
 
 
+@contextmanager
+def _refusals() -> Iterator[None]:
+    """Refuse a request that is not valid, or whose file cannot be written."""
+    try:
+        yield
+    except (Refused, RequestFailed):
+        raise
+    except OSError as error:
+        raise Refused("not_saved", f"{error.filename}: {error.strerror}") from None
+    except ZencellError as error:
+        raise Refused("bad_program", str(error)) from None

@@ -7,7 +7,6 @@ this step until the operator lets it continue.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import count
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -35,11 +34,10 @@ AHEAD = 3  # steps whose motions are planned before they begin
 ENDED = ("DONE", "ERROR")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PythonCall:
-    """A function to call; the number is unique in the process."""
+    """A function to call."""
 
-    number: int
     step: Python
     folder: Path
 
@@ -65,7 +63,6 @@ class ProgramTask(Task[View]):
         self._queued: list[tuple[StepCycle, Built]] = []  # steps whose stages are in the queue, the current one first
         self._attempts, self._spent, self._counted = 0, 0.0, 0.0
         self._not_ahead: Position | None = None  # the step during which nothing more is planned ahead
-        self._calls = count(1)
         self._halted = ""  # last reason in the status message
 
     # --- commands of the operator, besides those of each task ----------------------------------------------------
@@ -245,11 +242,11 @@ class ProgramTask(Task[View]):
         if isinstance(step, Wait) and step.seconds is not None and self._spent >= step.seconds:
             self._finish(SUCCEEDED)
         elif isinstance(step, Python) and self.call is None:
-            self.call = PythonCall(next(self._calls), step, self.at.file.path.parent)
+            self.call = PythonCall(step, self.at.file.path.parent)
 
-    def on_result(self, number: int, outcome: str, problem: str) -> None:
+    def on_result(self, call: PythonCall, outcome: str, problem: str) -> None:
         """Handle the end of a function of the user: its outcome, or why it failed."""
-        if self.call is None or self.call.number != number:
+        if self.call is not call:
             return  # the operator has gone to another step
         self.call = None
         if problem:
