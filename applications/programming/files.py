@@ -216,17 +216,18 @@ def _yaml(value: Any, indent: str) -> Iterator[str]:
             items = each.items() if isinstance(each, dict) else enumerate(each)
             for key, item in items:
                 if isinstance(each, dict):
-                    yield f"{indent}  {_flow(key)}: {_flow(item)}"
+                    yield f"{indent}  {flow_text(key)}: {flow_text(item)}"
                 elif any(body in item for body in _BODIES):
                     first, *rest = _yaml(item, f"{indent}    ")
                     yield f"{indent}  - {first.strip()}"
                     yield from rest
                 else:
-                    yield f"{indent}  - {_flow(item)}"
+                    yield f"{indent}  - {flow_text(item)}"
         else:
-            yield f"{indent}{name}: {_flow(each)}"
+            yield f"{indent}{name}: {flow_text(each)}"
 
 
-def _flow(value: Any) -> str:
+def flow_text(value: Any) -> str:
+    """Return a value as YAML on one line."""
     text: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=10**9, sort_keys=False)
     return text.removesuffix("\n").removesuffix("\n...")

@@ -5,8 +5,7 @@ A position is a stack of frames, one for each list of steps that is entered, the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from pydantic import BaseModel, ConfigDict
 
@@ -15,7 +14,7 @@ from applications.programming.handling import Palletize
 from applications.programming.model import BaseStep, Condition
 from applications.programming.steps import Call, If, Loop
 from common.errors import UnknownName
-from common.tasks.palletizing import Pattern, slots
+from common.tasks.palletizing import Pattern
 
 TOP = ""  # owner of the frame of a program itself
 TRANSITIONS = 50  # of control flow at once: a loop may have nothing to do
@@ -32,13 +31,13 @@ class Frame(BaseModel):
 
     program: str
     owner: str = TOP
-    body: Literal["steps", "then", "otherwise"] = "steps"
+    body: str = "steps"
     index: int = 0
     turn: int = 0
 
 
 Position = tuple[Frame, ...]  # empty: the end
-Decide = Callable[[Condition], bool]
+Decide = Callable[[Condition, Position], bool]  # at a step
 
 
 class Flow:
@@ -81,21 +80,17 @@ class Flow:
         Raises:
             UnknownName: lists the choices.
         """
-        def search(body: Sequence[BaseStep], above: Position, frame: Frame) -> Position | None:
-            for index, step in enumerate(body):
+        def search(above: Position, frame: Frame) -> Iterator[Position]:
+            for index, step in enumerate(self._body(frame)):
                 here = (*above, frame.model_copy(update={"index": index}))
                 if step.id == id_:
-                    return here
+                    yield here
                 for name in type(step).BODIES:
-                    found = search(getattr(step, name), here, Frame(program=self.main, owner=step.id, body=name))
-                    if found is not None:
-                        return found
-            return None
+                    yield from search(here, Frame(program=self.main, owner=step.id, body=name))
 
-        file = self.files[self.main]
-        found = search(file.program.steps, (), Frame(program=self.main))
+        found = next(search((), Frame(program=self.main)), None)
         if found is None:
-            raise UnknownName("step", id_, file.steps)
+            raise UnknownName("step", id_, self.files[self.main].steps)
         return found
 
     def is_leaf(self, position: Position) -> bool:
@@ -111,24 +106,23 @@ class Flow:
         step, program = self.step(position), position[-1].program
         if isinstance(step, Call):
             return (*position, Frame(program=step.program))
+        body, enters = "steps", True
         if isinstance(step, If):
-            body: Literal["steps", "then", "otherwise"] = "then" if decide(step.condition) else "otherwise"
+            body = "then" if decide(step.condition, position) else "otherwise"
             enters = bool(getattr(step, body))
-        else:
-            body, enters = "steps", not isinstance(step, Loop) or step.count != 0
-            if isinstance(step, Loop) and step.condition is not None:
-                enters = decide(step.condition)
+        elif isinstance(step, Loop):
+            enters = step.count != 0 if step.condition is None else decide(step.condition, position)
         return (*position, Frame(program=program, owner=step.id, body=body)) if enters else self.after(position)
 
     def after(self, position: Position) -> Position:
         """Return the position after a step, which may be at a step that leads to others."""
         *above, frame = position
         frame = frame.model_copy(update={"index": frame.index + 1})
-        owner = self._steps[frame.program].get(frame.owner) if frame.owner else None
+        owner = self._steps[frame.program].get(frame.owner)
         if frame.index < len(self._body(frame)) + isinstance(owner, Palletize):
             return (*above, frame)
         again = frame.model_copy(update={"index": 0, "turn": frame.turn + 1})
-        if isinstance(owner, Palletize) and again.turn < places_of(owner):
+        if isinstance(owner, Palletize) and again.turn < owner.places:
             return (*above, again)
         if isinstance(owner, Loop):
             if owner.condition is not None:
@@ -152,25 +146,26 @@ class Flow:
     def repetitions(self, position: Position) -> list[str]:
         """Return the turns of the loops around a position, in words."""
         found = []
-        for frame in position:
-            owner = self._steps[frame.program].get(frame.owner) if frame.owner else None
+        for frame, owner in self._owners(position):
             if isinstance(owner, Loop | Palletize):
-                total = places_of(owner) if isinstance(owner, Palletize) else owner.count
+                total = owner.places if isinstance(owner, Palletize) else owner.count
                 found.append(f"{owner.id}: {frame.turn + 1}{f' of {total}' if total is not None else ''}")
         return found
 
     def patterns(self, position: Position) -> list[Pattern]:
         """Return the patterns that are filled around a position: what is placed there is not picked again."""
-        owners = [self._steps[frame.program].get(frame.owner) for frame in position]
-        return [owner.pattern for owner in owners if isinstance(owner, Palletize)]
+        return [owner.pattern for _, owner in self._owners(position) if isinstance(owner, Palletize)]
+
+    def endless(self, position: Position) -> str:
+        """Return the id of a loop without end around a position that has turned once; empty without one."""
+        return next((owner.id for frame, owner in self._owners(position) if isinstance(owner, Loop) and frame.turn
+                     and owner.count is None and owner.condition is None), "")
+
+    def _owners(self, position: Position) -> list[tuple[Frame, BaseStep | None]]:
+        return [(frame, self._steps[frame.program].get(frame.owner)) for frame in position]
 
     def _body(self, frame: Frame) -> Sequence[BaseStep]:
         if not frame.owner:
             return self.files[frame.program].program.steps
         body: Sequence[BaseStep] = getattr(self._steps[frame.program][frame.owner], frame.body)
         return body
-
-
-def places_of(step: Palletize) -> int:
-    """Return the number of places on a pallet."""
-    return len(slots(step.pattern))

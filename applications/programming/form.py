@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import copy
-import itertools
 import math
 import re
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -17,6 +15,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from applications.programming.editing import Data, EditRefused, bodies
+from applications.programming.files import flow_text
 from applications.programming.model import STEPS, BaseStep, Condition, Part, Target
 from common.config import parse_yaml
 from common.errors import ConfigError
@@ -27,7 +26,6 @@ UNITS = {  # by that of the file: displayed per stored value, and the unit that 
 LABELS = {"rpy": "Roll, pitch, yaw", "by": "Displacement", "name": "Pose", "wait": "Wait for", "loop": "Repeat"}
 COMMON = ("id", "note", "on_failure", "speed", "touch", "requires")  # rarely changed, listed last
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)e[+-]?\d{1,3}", re.IGNORECASE)  # which is a text in YAML
-ZERO = [0.0, 0.0, 0.0]
 Path = tuple[str | int, ...]
 
 
@@ -98,22 +96,20 @@ class FormField:
             ConfigError: the value cannot be read.
         """
         stored = self.parse(shown)
-        if not self.path:
-            return dict(stored)
-        first, *rest = self.path
-        if not rest:
-            return {str(first): stored}
-        top = [copy.deepcopy(step.get(str(first)))]  # in a list, so that it can be replaced as well
-        inner: Any = top
-        for part, following in itertools.pairwise((0, *rest)):
-            if isinstance(inner[part], str) and isinstance(following, str):  # a target that is given by its name
-                inner[part] = {"name": inner[part]}
-            inner = inner[part]
-        if stored is None and isinstance(inner, dict):
-            inner.pop(rest[-1], None)
-        else:
-            inner[rest[-1]] = stored
-        return {str(first): top[0]}
+        return {str(self.path[0]): _with(step.get(str(self.path[0])), self.path[1:], stored)} if self.path else dict(
+            stored)
+
+
+def _with(data: Any, path: Path, value: Any) -> Any:
+    """Return a copy of data with another value at a path; None removes it."""
+    if not path:
+        return value
+    first, *rest = path
+    if isinstance(first, int):
+        return [_with(each, tuple(rest), value) if number == first else each for number, each in enumerate(data)]
+    data = {"name": data} if isinstance(data, str) else data or {}  # a target that is given by its name
+    new = _with(data.get(first), tuple(rest), value)
+    return {key: each for key, each in {**data, first: new}.items() if each is not None}
 
 
 def fields_of(step: Data, known: Known, point: int = 0) -> list[FormField]:
@@ -219,16 +215,16 @@ def _field(info: FieldInfo, name: str, path: Path, value: Any, known: Known) -> 
     hint = re.sub(r" *\[[^]]*\]", "", info.description or "").lstrip("; ")  # the unit of the file
     choices = {"name": known.poses, "signal": known.outputs if path == ("signal",) else known.signals,
                "program": known.programs}.get(name)
-    literals = [each for each in get_args(info.annotation) if isinstance(each, str)] if (
-        get_origin(info.annotation) is Literal) else None
+    if get_origin(info.annotation) is Literal:
+        choices = get_args(info.annotation)
     given = default if value is None else value
-    if literals or (choices and given in choices):
-        return FormField(path, label, "choice", given, hint, str, list(literals or choices or ()))
+    if choices and given in choices:
+        return FormField(path, label, "choice", given, hint, str, list(choices))
     if info.annotation is bool:
         return FormField(path, label, "check", bool(given), hint, bool)
-    size = _tuple_size(info.annotation)
+    size = next((len(get_args(each)) for each in _types(info.annotation) if get_origin(each) is tuple), 0)
     if size == 3:
-        vector = tuple(round(scale * each, 3) for each in (given or ZERO))
+        vector = tuple(round(scale * each, 3) for each in (given or (0.0, 0.0, 0.0)))
         return FormField(path, label, "vector", vector, hint, lambda entered: [each / scale for each in entered])
     if size or name == "joints":
         values, scales = list(given or ()), [scale] * size
@@ -237,13 +233,12 @@ def _field(info: FieldInfo, name: str, path: Path, value: Any, known: Known) -> 
             scales = list(known.scales) if len(known.scales) == len(values) else [DEGREE] * len(values)
         shown = ", ".join(f"{round(scale * each, 3):g}" for scale, each in zip(scales, values, strict=bool(values)))
         return FormField(path, label, "text", shown, hint, partial(_numbers, name, scales))
-    is_text = info.annotation is str
     brackets = {list: "[]", dict: "{}"}.get(get_origin(info.annotation) or str, "")
     shown = "" if given in (None, [], {}) else _text(given, scale)
     if not info.is_required() and default not in (None, "", [], {}):
         hint += f"{'; ' if hint else ''}empty: {_text(default, scale)}"
-    return FormField(path, label, "text", shown, hint, partial(_words, brackets) if is_text else partial(
-        _value, name, scale, brackets))
+    return FormField(path, label, "text", shown, hint, lambda entered: entered.strip() or None) if (
+        info.annotation is str) else FormField(path, label, "text", shown, hint, partial(_value, name, scale, brackets))
 
 
 def _text(value: Any, scale: float) -> str:
@@ -253,13 +248,8 @@ def _text(value: Any, scale: float) -> str:
         return f"{round(scale * value, 6):g}" if abs(scale * value) < 1e6 else str(value)
     if isinstance(value, str):
         return value
-    written: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=10**9, sort_keys=False)
-    written = written.removesuffix("\n").removesuffix("\n...")
+    written = flow_text(value)
     return written[1:-1] if isinstance(value, dict | list) else written
-
-
-def _words(_brackets: str, entered: str) -> str | None:
-    return entered.strip() or None
 
 
 def _value(name: str, scale: float, brackets: str, entered: str) -> Any:
@@ -267,8 +257,7 @@ def _value(name: str, scale: float, brackets: str, entered: str) -> Any:
     entered = entered.strip()
     if not entered:
         return None
-    if brackets:
-        entered = f"{brackets[0]}{entered}{brackets[1]}"
+    entered = f"{brackets[:1]}{entered}{brackets[1:]}"
     try:
         value = float(entered) if _NUMBER.fullmatch(entered) else parse_yaml(entered)
     except (yaml.YAMLError, ValueError):
@@ -291,19 +280,13 @@ def _numbers(name: str, scales: Sequence[float], entered: str) -> list[float] | 
             for value, scale in zip(values, scales, strict=True)]
 
 
-def _tuple_size(annotation: Any) -> int:
-    """Return the number of values of a tuple; 0 for another type."""
-    if get_origin(annotation) is tuple:
-        return len(get_args(annotation))
-    if get_origin(annotation) in (Union, types.UnionType, Annotated):
-        return max((_tuple_size(each) for each in get_args(annotation)), default=0)
-    return 0
+def _types(annotation: Any) -> Iterator[Any]:
+    yield annotation
+    if get_origin(annotation) in (list, Union, types.UnionType, Annotated):
+        for each in get_args(annotation):
+            yield from _types(each)
 
 
 def _part_in(annotation: Any) -> type[BaseModel] | None:
     """Return the model of a field, or of the items of a list."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    if get_origin(annotation) in (list, Union, types.UnionType, Annotated):
-        return next((found for each in get_args(annotation) if (found := _part_in(each))), None)
-    return None
+    return next((each for each in _types(annotation) if isinstance(each, type) and issubclass(each, BaseModel)), None)

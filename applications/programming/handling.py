@@ -111,6 +111,11 @@ class Palletize(BaseStep):
     def __str__(self) -> str:
         return f"palletize {self.pattern.columns} x {self.pattern.rows} x {self.pattern.layers}"
 
+    @property
+    def places(self) -> int:
+        """Number of places on the pallet."""
+        return len(slots(self.pattern))
+
     def placing(self, number: int) -> PlaceOnPallet:
         """Return the step that places an item at a place of the pallet, counted from 0."""
         return PlaceOnPallet(

@@ -10,10 +10,10 @@ from dataclasses import replace
 
 from applications.programming.building import Builder, Outlook, ProgramMove
 from applications.programming.files import ProgramFile
-from applications.programming.flow import TRANSITIONS, Flow, Position
+from applications.programming.flow import Flow, Position, Undecided
 from applications.programming.handling import Pick
 from applications.programming.model import BaseStep, Condition, walk
-from applications.programming.steps import If, Loop, Wait
+from applications.programming.steps import If, Wait
 from applications.programming.targets import Cell, NotSeen
 from applications.programming.topics import Rehearsal, RehearsedStep
 from common import messages as m
@@ -66,10 +66,8 @@ class Rehearser:
         assert view.q is not None and view.scene is not None
         self.flow, self.cell, self.io, self._planning_time = flow, cell, io, planning_time
         self.result = Rehearsal(program=flow.main, state="running")
-        self.trajectories: list[m.JointTrajectory] = []  # of the newest step
         self._q, self.scene, self._view = list(view.q), view.scene, view
         self._now = Outlook.of(view)
-        self._outcome = "succeeded"
         self.planned = 0
         self._turned: dict[Position, bool] = {}  # loops by condition that have turned once
         self._visited: set[str] = set()
@@ -87,13 +85,14 @@ class Rehearser:
         begin = self._q, self.scene, self._now
         position = start
         while position and len(self.result.steps) < MOST:
-            position = self._leaf(position)
-            if not position:
+            try:
+                position = self.flow.leaf(position, self._assume)
+            except Undecided:  # there is nothing to do
                 break
-            step = self.flow.step(position)
-            yield from self._rehearse(step, self.flow.file(position), assumed="")
-            position = self.flow.after(position)
-            if endless := self._endless(position):
+            if position:
+                yield from self._rehearse(self.flow.step(position), self.flow.file(position))
+                position = self.flow.after(position)
+            if endless := self.flow.endless(position):
                 self.result.message = f"{endless} repeats without end: one turn is planned"
                 break
         if len(self.result.steps) >= MOST:
@@ -102,18 +101,16 @@ class Rehearser:
             for file in self.flow.files.values():
                 for step in file.steps.values():
                     if step.id not in self._visited and not type(step).BODIES:
-                        self._q, self.scene, self._now = begin
-                        self._lost = ""
-                        yield from self._rehearse(step, file, assumed="is not reached in the dry run: planned from the "
-                                                                       "state at the start")
+                        (self._q, self.scene, self._now), self._lost = begin, ""
+                        yield from self._rehearse(
+                            step, file, "is not reached in the dry run: planned from the state at the start")
         failed = any(each.problem for each in self.result.steps)
         self.result.state, self.result.step = "failed" if failed else "done", ""
 
-    def _rehearse(self, step: BaseStep, file: ProgramFile, assumed: str) -> Planning:
+    def _rehearse(self, step: BaseStep, file: ProgramFile, assumed: str = "") -> Planning:
         """Plan one step and add it to the result."""
         self._visited.add(step.id)
         self.result.step = step.id
-        self.trajectories = []
         item = RehearsedStep(program=file.name, step=step.id, kind=step.step)
         if problem := self._wrong.get(step.id, ""):
             item.problem = problem
@@ -125,8 +122,7 @@ class Rehearser:
         else:
             yield from self._plan(step, file, item)
         after = f"begins after {self._lost}, whose end is not known" if self._lost not in ("", step.id) else ""
-        notes = [assumed, after]
-        item.unknown = "; ".join(each for each in [item.unknown, *notes] if each)
+        item.unknown = "; ".join(each for each in (item.unknown, assumed, after) if each)
         self.result.seconds += item.seconds or 0.0
         self.result.steps.append(item)
 
@@ -149,10 +145,9 @@ class Rehearser:
                 response = yield self._request(stage)
                 if response.trajectory is None or not response.ok:
                     item.problem, self._lost = response.message[:500], self._lost or step.id
-                    if isinstance(stage.goal, m.JointGoal):
-                        self._q = self._positions(stage.goal)
+                    if isinstance(goal := stage.goal, m.JointGoal):
+                        self._q = list(goal.positions or self.cell.robot.config.named_poses[goal.named])
                     break
-                self.trajectories.append(response.trajectory)
                 seconds += response.trajectory.points[-1].time_from_start
                 self._q = list(response.trajectory.points[-1].positions)
             elif isinstance(stage, engine.Grip):
@@ -181,9 +176,6 @@ class Rehearser:
             return None
         return min(max(self._now.width, 0.0), gripper.max_width)
 
-    def _positions(self, goal: m.JointGoal) -> list[float]:
-        return list(goal.positions or self.cell.robot.config.named_poses[goal.named])
-
     def _release(self) -> None:
         """Leave the held object in the scene where it is released; it is not picked again."""
         if not self._now.object or self._now.pose is None:
@@ -193,28 +185,12 @@ class Rehearser:
                    if each.id == self._now.object else each for each in self.scene.objects]
         self.scene = self.scene.model_copy(update={"objects": objects})
 
-    def _leaf(self, position: Position) -> Position:
-        for _ in range(TRANSITIONS):
-            if not position or self.flow.is_leaf(position):
-                return position
-            here = position
-            position = self.flow.enter(here, lambda condition, here=here: self._assume(condition, here))  # type: ignore[misc]
-        return ()
-
     def _assume(self, condition: Condition, position: Position) -> bool:
         step = self.flow.step(position)
         if condition.holding is not None and isinstance(step, If):
             return self._now.holding is condition.holding
         if condition.outcome and isinstance(step, If):
-            return condition.outcome == self._outcome
+            return condition.outcome == "succeeded"
         first = not self._turned.get(position, False)
         self._turned[position] = first
         return first or isinstance(step, If)
-
-    def _endless(self, position: Position) -> str:
-        """Return the id of a loop without end that has turned once."""
-        for frame in position:
-            owner = self.flow.files[frame.program].steps.get(frame.owner) if frame.owner else None
-            if isinstance(owner, Loop) and owner.count is None and owner.condition is None and frame.turn:
-                return owner.id
-        return ""

@@ -24,7 +24,7 @@ from common.errors import ZencellError
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
 from common.tasks.force import ForceMove
-from common.tasks.palletizing import Pattern, slots
+from common.tasks.palletizing import Pattern
 from common.tasks.signals import Output, WaitFor, condition_met
 from common.tasks.stages import MISSES, Grip, Stage, View
 from common.time_source import monotonic
@@ -70,7 +70,7 @@ class Steps:
         """Yield the number of each place of a pallet, then place there what the gripper holds."""
         step = check(Palletize, {**fields, "steps": [{"step": "wait", "seconds": 0}]})
         self._patterns.append(step.pattern)
-        for number in range(len(slots(step.pattern))):
+        for number in range(step.places):
             yield number
             self._do(step.placing(number))
         self._patterns.pop()

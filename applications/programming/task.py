@@ -228,7 +228,7 @@ class ProgramTask(Task[View]):
     def _follow(self, view: View, passed: float) -> None:
         """Begin the next step, or continue one without stages; `passed` since the last step of the engine [s]."""
         try:
-            if not self.at.in_step and self.at.advance(lambda condition: self._holds(condition, view)):
+            if not self.at.in_step and self.at.advance(lambda condition, _: self._holds(condition, view)):
                 self.at.begin(view.tcp, holding=view.holding)
                 self._spent = 0.0
                 self.status.state, self.status.message = "RUNNING", ""
@@ -343,5 +343,5 @@ class ProgramTask(Task[View]):
         return True
 
 
-def _undecided(condition: Condition) -> bool:
+def _undecided(condition: Condition, position: Position) -> bool:
     raise Undecided

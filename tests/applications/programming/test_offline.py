@@ -144,13 +144,13 @@ steps:
 """)))
     flow = Flow({file.name: file}, file.name)
     seen, position = [], flow.start
-    while position := flow.leaf(position, lambda condition: False):
+    while position := flow.leaf(position, lambda condition, _: False):
         seen.append(flow.step(position).id)
         assert flow.contains(position) and flow.find("a")
         position = flow.after(position)
     assert seen == ["a", "b", "p", "b", "p"] * 2
 
-    def unknown(condition: object) -> bool:
+    def unknown(condition: object, position: object) -> bool:
         raise Undecided
 
     with pytest.raises(Undecided):
