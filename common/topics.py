@@ -103,6 +103,8 @@ ROBOT_STATUS = Topic("robot/status", m.RobotStatus, "state",
 ROBOT_DESCRIPTION = Topic("robot/description", m.RobotDescription, "state",
                           "the arm: joints, limits, named poses, tool frame")
 IO_STATE = Topic("io/state", m.IoState, "state", "inputs and outputs: value, time of its change, quality")
+IO_SENSED = Topic("io/sensed", m.IoState, "state",
+                  "signals that the simulated world determines, as of a vacuum switch; simulated hardware only")
 ARMS_STATUS = Topic("arms/status", m.ArmsStatus, "state", "motions of several arms: queue, holds")
 CONVEYOR_STATE = Topic("conveyor/state", m.ConveyorState, "state", "belts: encoder, speed, light barrier, 50 Hz")
 DISPLAY_TRAJECTORY = Topic("display_trajectory", m.JointTrajectory, "state", "newest plan")

@@ -9,10 +9,11 @@ from typing import TypeVar
 from pydantic import Field
 
 from common import topics
-from common.config import Io, Tunable
+from common.config import Cups, Io, Tunable
 from common.control.signal_server import SignalServer
 from common.errors import ConfigError
-from common.hardware.signals import load_io
+from common.hardware.interface import has_simulated_world
+from common.hardware.signals import WorldSignals, load_io
 from common.messages import Message
 from common.process.service import main
 from common.process.timing import Reopening
@@ -27,6 +28,7 @@ class Config(Reopening):
     """Rates and timeouts; the signals are those of the cell."""
 
     io: Io = Io()
+    cups: Cups = Cups()
     rate: Tunable[float] = Field(20.0, ge=0.5, le=100, description="all signals are read so often in cell time [Hz]")
     answer_timeout: Tunable[float] = Field(
         1.0, ge=0.05, le=60, description="a backend that takes longer to answer is lost [s, wall time]"
@@ -45,6 +47,11 @@ async def run(bus: Bus, config: Config) -> None:
     if not config.io.signals:
         raise ConfigError("io.signals", ..., f"is missing: the service {bus.service} needs named signals")
     connection = load_io(config.io, bus.clock.now)
+    simulated = [name for robot in config.cups.robots if has_simulated_world(robot) for name in robot.cup_signals]
+    world = connection if simulated and isinstance(connection, WorldSignals) else None
+    sensed = bus.reader(topics.IO_SENSED) if world is not None else None
+    if world is not None:
+        world.expect(simulated)
     motion, owner = bus.reader(topics.MOTION_STATUS), bus.reader(topics.MOTION_OWNER)
     out = bus.writer(topics.IO_STATE)
     server = SignalServer(config.io, connection, config, bus.clock, bus.log, out.put)
@@ -59,6 +66,8 @@ async def run(bus: Bus, config: Config) -> None:
     async with asyncio.TaskGroup() as group:
         group.create_task(take(motion, server.set_motion))
         group.create_task(take(owner, server.set_owner))
+        if sensed is not None and world is not None:
+            group.create_task(take(sensed, world.sense))
         await server.run(lambda: 1 / bus.clock.wall_rate(config.rate, MAX_TURNS))
 
 

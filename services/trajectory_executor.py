@@ -29,6 +29,7 @@ from common.process.hosted_arms import create_executors, hosted_arms
 from common.process.reservation import Reservation
 from common.process.service import main
 from common.process.stop_of_all import StopOfAllArms
+from common.process.vacuum_link import VacuumLink
 from common.sim.interface import GraspTolerances
 from common.sim.state_file import BackgroundSaver, Saver, StateFile
 from common.transport.bus import Bus
@@ -182,7 +183,9 @@ class HostedArm:
             self.executor.authority.disown_task()
         self.executor.force_motions.task_present = self._present
         orphaned = self._orphan_policy.update(self._present, self.executor.arm.goal, self._config.when_alone)
-        self.executor.authority.hold_by_controller(orphaned, f"{self._task} is gone")
+        cup = self.executor.vacuum
+        lost = cup.unwatched if cup is not None and self.executor.arm.goal else ""
+        self.executor.authority.hold_by_controller(orphaned or bool(lost), lost or f"{self._task} is gone")
 
     async def close(self) -> None:
         """End what runs beside the cycle."""
@@ -209,6 +212,7 @@ async def run(
     stops = StopOfAllArms(bus, [name for name in config.arms.robots if name not in robots])
     arms = [HostedArm(name, bus, config, robot, stops, reports_world=simulated and not at)
             for at, (name, robot) in enumerate(robots.items())]
+    link = VacuumLink(bus, robots.values(), simulated)
     if config.arms.robots and not config.arms.own:  # STOP of the cell, for clients that name no arm
         bus.serve(topics.MOTION_STOP, partial(stops.stop, arms[0].name), max_pending=MAX_STOPS,
                   on_overload=stops.stop_for_unread)
@@ -241,13 +245,14 @@ async def run(
         if world is not None and world.restored:
             bus.log.info("the arm and its surroundings are as they were before the restart")
         try:
-            await control(bus, arms, period)
+            await control(bus, arms, period, link)
         finally:
+            await link.close()
             for arm in arms:
                 await arm.close()
 
 
-async def control(bus: Bus, arms: Sequence[HostedArm], period: float) -> None:
+async def control(bus: Bus, arms: Sequence[HostedArm], period: float, link: VacuumLink) -> None:
     """Run a control cycle of every arm each `period` of wall time [s] until cancelled; then bring them to rest."""
     loop = asyncio.get_running_loop()
     due = loop.time()
@@ -256,6 +261,7 @@ async def control(bus: Bus, arms: Sequence[HostedArm], period: float) -> None:
         nonlocal due
         for arm in arms:
             arm.cycle()
+        link.update([arm.executor.vacuum for arm in arms if arm.executor.vacuum is not None])
         due = max(due + period, loop.time())  # no burst after an overrun
 
     try:

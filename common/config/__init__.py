@@ -12,6 +12,7 @@ from common.config.basics import Coordinate, Length, Number, Parameters, Point, 
 from common.config.cell import (
     Arms,
     Cell,
+    Cups,
     Grasp,
     Members,
     Motion,

@@ -14,6 +14,7 @@ from common.config.basics import Section, Tunable
 from common.config.io import Io
 from common.config.robot import RobotConfig
 from common.config.world import Container, Scenery, Surroundings, World
+from common.errors import UnknownName
 from common.remapping import POSE_KEYS, is_cell
 
 
@@ -147,6 +148,12 @@ class Arms(Section):
         return self.own or next(iter(self.robots), "")
 
 
+class Cups(Section):
+    """The robots of a cell whose suction cups are driven by its I/O."""
+
+    robots: list[RobotConfig] = []
+
+
 class Reach(Section):
     """Parameters of all services: some of them define the reachable workspace."""
 
@@ -177,6 +184,16 @@ class Cell(Section):
     @model_validator(mode="after")
     def _distinct_arms(self) -> Cell:
         require_distinct(self.robots)
+        return self
+
+    @model_validator(mode="after")
+    def _vacuum_is_digital(self) -> Cell:
+        for robot in (self.robot, *self.robots.values()):
+            for name, kind in robot.cup_signals.items():
+                names = [each for each, signal in self.io.signals.items()
+                         if signal.range is None and signal.is_output == (kind == "output")]
+                if name not in names:
+                    raise UnknownName(f"digital {kind} in robot.gripper.vacuum.{kind}", name, names)
         return self
 
     @property
@@ -236,6 +253,9 @@ class Cell(Section):
             task = self.arms.tasks.get(arm, self.task) if arm else self.task
             keys = [each.topics for each in self.services.values() if not each.arm and each.topics.keys() - POSE_KEYS]
             return Members(services=names, task=task, application=self.application, keys=keys if arm else self.tables)
+        if kind is Cups:
+            robots = self.robots.values() or (self.robot,)
+            return Cups(robots=[robot for robot in robots if robot.cup_signals])
         if kind is Arms:
             return self.arms.model_copy(update={"own": arm})
         if kind is RobotConfig and arm:

@@ -55,6 +55,14 @@ class SuctionCup(Section):
         return self.vacuum * math.pi * self.lip_radius**2
 
 
+class VacuumSignals(Section):
+    """Digital signals of the cell that drive a suction cup: docs/suction.md."""
+
+    output: str = Field(description="switches the vacuum on")
+    input: str = Field(description="vacuum switch: on while an object seals the cup")
+    timeout: float = Field(1.0, gt=0, le=60, description="from a command until the signals show its result [s]")
+
+
 class PayloadConfig(Section):
     """Payload for the arm's controller; centres of mass [m] from the flange, z out of it."""
 
@@ -89,6 +97,7 @@ class GripperConfig(Section):
     fingers: FingerShape = FingerShape()
     payload: PayloadConfig | None = Field(None, description="payload for the arm's controller; default: not set")
     cup: SuctionCup | None = Field(None, description="suction cup instead of fingers")
+    vacuum: VacuumSignals | None = Field(None, description="signals in `io` that drive the cup")
     group: str = Field("gripper", description="group name of the fingers")
     joints: list[str] = Field([], description="finger joints, the driven one first")
     mimic: list[Number] = Field([], description="each joint per driven joint; all 1 when empty")
@@ -113,6 +122,8 @@ class GripperConfig(Section):
     def _fits(self) -> GripperConfig:
         if bool(self.joints) == (self.cup is not None):
             raise ValueError("gripper needs either joints or a cup")
+        if self.vacuum is not None and (self.cup is None or self.hardware is not None):
+            raise ValueError("gripper.vacuum needs a cup, and no gripper.hardware: signals of the cell drive it")
         if self.mimic and len(self.mimic) != len(self.joints):
             raise ValueError(f"gripper.mimic has {len(self.mimic)} values for {len(self.joints)} joints")
         if self.mimic and self.mimic[0] != 1:
@@ -246,6 +257,12 @@ class RobotConfig(Section):
     torque_limit: float = Field(
         10.0, gt=0, le=1000, description="the same of the torque at the tool centre point [N m]")
     hardware: HardwareConfig = HardwareConfig()
+
+    @property
+    def cup_signals(self) -> dict[str, str]:
+        """Kind, input or output, of the cell's signals that drive its suction cup, by name."""
+        vacuum = self.gripper.vacuum if self.gripper is not None else None
+        return {} if vacuum is None else {vacuum.output: "output", vacuum.input: "input"}
 
     @model_validator(mode="before")
     @classmethod

@@ -22,6 +22,7 @@ from common.control.motion_authority import MotionAuthority
 from common.control.status import ChangeDetector, Report, joint_state
 from common.control.trajectory import Tolerances, Trajectory
 from common.control.trajectory_controller import PERIOD, TrajectoryController
+from common.control.vacuum import VacuumCup
 from common.control.vendor_controller import VendorController
 from common.errors import ConfigError, Refused
 from common.hardware.interface import (
@@ -60,6 +61,7 @@ class Executor:
         world: the simulated world; None with real hardware.
         force_motions: checks force motions and watches their requester.
         vendor: the arm's own controller, which only real arms have.
+        vacuum: the gripper, if it is a cup that the cell's I/O drives.
     """
 
     def __init__(
@@ -73,6 +75,7 @@ class Executor:
         controller: str = "controller",
         kinematics: ToolKinematics | None = None,
         world: WorldBackend | None = None,
+        vacuum: VacuumCup | None = None,
         interlocks: Interlocks | None = None,
         force: ForceSensing | None = None,
         period: float = PERIOD,
@@ -87,7 +90,7 @@ class Executor:
             raise ConfigError("robot.hardware.backend", type(hardware).__name__,
                               "has no gripper, but the robot has one: name its backend in robot.gripper.hardware")
         self._hardware, self._limits, self._gripper_config = hardware, limits, gripper
-        self.world, self.force = world, force or ForceSensing(hardware)
+        self.world, self.force, self.vacuum = world, force or ForceSensing(hardware), vacuum
         self.arm = TrajectoryController(limits, start, tolerances, name=controller, period=period)
         self._q = start.copy()
         self._was_read = False  # whether the position of the arm is known
@@ -101,9 +104,10 @@ class Executor:
         self.authority = MotionAuthority(self.arm, Jogging(limits, kinematics), self._interlocks)
         self.gripper, self._commands = None, None
         if gripper is not None and hardware.gripper is not None:
-            self.gripper = GripperController(hardware.gripper, gripper)
+            self.gripper = GripperController(vacuum or hardware.gripper, gripper)
             self._commands = GripperCommands(
-                hardware.gripper, self.gripper, DeferredCommand(self.arm, kinematics), self.arm, self.authority, world)
+                hardware.gripper, self.gripper, DeferredCommand(self.arm, kinematics), self.arm, self.authority, world,
+                vacuum)
 
     # --- the cycle ------------------------------------------------------------------------------------------------
 
@@ -297,9 +301,11 @@ class Executor:
         gripper = self._hardware.gripper
         if state is None or self.gripper is None or gripper is None:
             return
-        if state.commanded_width is not None:
+        if self.vacuum is not None:
+            self.vacuum.restore(state.width or 0.0, now)
+        elif state.commanded_width is not None:
             self.gripper.resume(state.commanded_width, now, state.commanded_effort)
-        self.gripper.update(gripper.read(now), now)
+        self.gripper.update((self.vacuum or gripper).read(now), now)
 
     def close(self) -> None:
         """Release the hardware, and close the world."""

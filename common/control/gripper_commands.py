@@ -6,6 +6,7 @@ from common.control.devices import DeviceFault, read_gripper
 from common.control.gripper_controller import DeferredCommand, GripperController
 from common.control.motion_authority import MotionAuthority
 from common.control.trajectory_controller import TrajectoryController
+from common.control.vacuum import VacuumCup
 from common.errors import Refused
 from common.hardware.interface import Gripper, HardwareFault, Vector, WorldBackend
 from common.messages import CLOSED_BEFORE, GripperCommand, GripperState
@@ -21,11 +22,11 @@ class GripperCommands:
 
     def __init__(
         self, device: Gripper, gripper: GripperController, deferred: DeferredCommand, arm: TrajectoryController,
-        authority: MotionAuthority, world: WorldBackend | None,
+        authority: MotionAuthority, world: WorldBackend | None, vacuum: VacuumCup | None = None,
     ) -> None:
-        """Command this gripper, whose fingers objects of a simulated world block."""
+        """Command this gripper, whose fingers objects of a simulated world block; I/O may drive a simulated cup."""
         self._device, self._gripper, self._deferred = device, gripper, deferred
-        self._arm, self._authority, self._world = arm, authority, world
+        self._arm, self._authority, self._world, self._vacuum = arm, authority, world, vacuum
         self.fault = DeviceFault("the gripper")
         self.width_rate = 0.0
 
@@ -39,6 +40,9 @@ class GripperCommands:
             reading = read_gripper(self._device, now)
             if self._world is not None:
                 self._world.step(now, q, reading)
+            if self._vacuum is not None and self._vacuum is not self._device:
+                self._vacuum.sense(reading)
+                reading = self._vacuum.read(now)
             self.width_rate = reading.velocity
             self._gripper.update(reading, now)
             self.fault.clear(now)
@@ -72,7 +76,8 @@ class GripperCommands:
     def command(self, request: GripperCommand, now: float, refusal: Refused | None) -> GripperState:
         """Return the state of a goal, which is rejected if there is a `refusal` already."""
         refusal = (self._authority.check_interlocks(request, request.id) or refusal
-                   or self._authority.check_owner(request.owner) or self.fault.check())
+                   or self._authority.check_owner(request.owner) or self.fault.check()
+                   or (self._vacuum.check() if self._vacuum is not None else None))
         deferred = bool(request.after) and request.after == self._arm.goal
         if request.after and not deferred and self._arm.fails(request.after):
             refusal = refusal or Refused("unknown_goal", f"goal {request.after!r} is not followed now")

@@ -16,6 +16,7 @@ from common.control.devices import call_device
 from common.control.goals import REMEMBERED, GoalMemory
 from common.control.jogging import ToolKinematics
 from common.control.trajectory_controller import TrajectoryController
+from common.control.vacuum import VacuumCup
 from common.errors import Refused
 from common.hardware.interface import Gripper, GripperReading, Vector
 from common.messages import GripperCommand, GripperState
@@ -89,6 +90,8 @@ class GripperController:
         Raises:
             HardwareFault: the gripper does not work.
         """
+        if isinstance(self._gripper, VacuumCup):
+            self._gripper.request = request
         self._send(request.width, now, request.effort)
         if self.state.state == "active":
             replaced = {"state": "cancelled", "message": f"replaced by {request.id!r}"}
@@ -202,8 +205,8 @@ class GripperController:
             found = "wide" if off > 0 else "narrow"
             message = f"the fingers closed on something too {found} ({width:.4f} m, not {expected:.4f} m)"
             return {"state": "aborted", "outcome": f"too_{found}", "message": message}
-        if abs(width - self._target) > SETTLED and not reading.holding:
-            message = f"fingers stopped at {width:.4f} m, not at {self._target:.4f} m"
+        if abs(width - self._target) > SETTLED and (reading.message or not reading.holding):
+            message = reading.message or f"fingers stopped at {width:.4f} m, not at {self._target:.4f} m"
             return {"state": "aborted", "message": message}
         if expected is not None:
             message = reading.message or "the fingers closed on nothing"
@@ -213,9 +216,10 @@ class GripperController:
     def _watch_held(self, reading: GripperReading, held: float) -> dict[str, object]:
         """Return whether an object, `held` [m] wide, is still grasped."""
         if reading.holding and reading.width >= held - SLIPPED:
-            return {"outcome": "grasped", "message": ""}
+            return {"outcome": "grasped", "message": reading.message}
         if self._config.cup is not None:
-            message = "the held object came off the cup"
+            why = f": {reading.message}" if self._config.vacuum is not None and reading.message else ""
+            message = f"the held object came off the cup{why}"
         elif reading.holding:
             message = f"the held object slips: it was {held:.4f} m wide, the fingers are {reading.width:.4f} m apart"
         else:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol, cast
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 from common.config import Io, Parameters, Signal, check
 from common.config.io import Value
 from common.errors import ConfigError
+from common.messages import IoState
 from common.plugins import find_plugin
 
 GROUP, FIELD, MARKER = "zencell.io", "io.backend", "create_io"
@@ -50,6 +51,17 @@ class IoConnection(Protocol):
 
     async def close(self) -> None:
         """Disconnect; outputs stay as they are."""
+
+
+@runtime_checkable
+class WorldSignals(IoConnection, Protocol):
+    """Simulated signals, some of which the simulated world determines."""
+
+    def expect(self, names: Iterable[str]) -> None:
+        """Leave these signals unreadable until `sense` reports them."""
+
+    def sense(self, state: IoState) -> None:
+        """Take inputs of the simulated world; outputs only at first, as hardware keeps them over a restart."""
 
 
 class IoBackend(Protocol):

@@ -14,6 +14,7 @@ from common.control.force_requests import ForceLimits
 from common.control.force_sensing import ForceSensing
 from common.control.interlocks import InterlockStore
 from common.control.trajectory import Tolerances
+from common.control.vacuum import VacuumCup
 from common.control.wrench import Payload
 from common.errors import ConfigError
 from common.hardware.backends import has_simulated_world, load_hardware
@@ -96,6 +97,10 @@ def create_executors(
         if isinstance(hardware, ControlledArm) and bus.clock.speed != 1.0:
             hardware.close()
             raise ConfigError("speed", bus.clock.speed, "must be 1: the arm has a controller with a clock of its own")
+        gripper, vacuum = model.config.gripper, None
+        if gripper is not None and gripper.vacuum is not None:
+            vacuum = VacuumCup(gripper, hardware.gripper)
+            hardware.gripper = hardware.gripper or vacuum
         cell = None if within is None else SimulatedCell(
             within, hardware, model, simulator=config.world.simulator, persisted=persisted[arm], saver=savers[arm],
             first=first_cell)
@@ -104,7 +109,7 @@ def create_executors(
         force = ForceSensing(hardware, model, model.config.tcp_link, model.config.gripper, model.config.wrench,
                              Payload(tool[0], *tool[1].tolist()) if tool is not None else None)
         found[arm] = Executor(
-            hardware, limits, start, tolerances=config.tolerances, gripper=model.config.gripper,
+            hardware, limits, start, tolerances=config.tolerances, gripper=gripper, vacuum=vacuum,
             controller=model.config.controller, kinematics=model, world=cell, interlocks=stores[arm].interlocks,
             force=force, period=period * bus.clock.speed,
             force_limits=ForceLimits(model.config.force_limit, model.config.torque_limit),

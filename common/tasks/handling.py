@@ -82,7 +82,7 @@ class Handling(Task[View]):
     def opening(self, width: float | None) -> float:
         """Return the finger width before a grasp and at a release of an object of a width, None if unknown [m]."""
         most = self.gripper.max_width
-        return most if width is None else min(width + self.p.finger_clearance, most)
+        return most if width is None or self.gripper.cup is not None else min(width + self.p.finger_clearance, most)
 
     # --- used by the task ----------------------------------------------------------------------------------------
 
@@ -193,11 +193,13 @@ class Handling(Task[View]):
     # --- stages --------------------------------------------------------------------------------------------------
 
     def _take(self, thing: m.CollisionObject, view: View) -> list[Stage]:
-        """Open, move above the object, descend, close, lift; then the stages of `put`."""
+        """Open, move above the object, descend, close, lift; then the stages of `put`. A cup takes the top face."""
         x, y, z = place_of(thing.pose)
         ways = grasp_directions(thing, self.gripper.closing_axis, self.gripper.max_width)
         yaw, width = ways[self._tries[thing.id] % 2]
         low, cycle = self.p.grasp.height(z), Cycle(thing.id)
+        if self.gripper.cup is not None:
+            low, width = top_of(thing), self.gripper.held_width
         T_world_tcp = tool_down(x, y, low, yaw)
         held = matrix_to_pose(invert(T_world_tcp) @ pose_to_matrix(thing.pose))
         above = _raised(T_world_tcp, self.p.grasp.approach_clearance)

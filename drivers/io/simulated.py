@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Self
 
 from pydantic import Field, model_validator
@@ -13,6 +13,7 @@ from common.config import Parameters, Section, Signal
 from common.config.io import Value
 from common.errors import ConfigError, UnknownName
 from common.hardware.signals import Unreadable
+from common.messages import IoState
 
 
 class Behavior(Section):
@@ -50,6 +51,7 @@ class SimulatedIo:
         self._signals, self._behaviors, self._now = signals, options.behaviors, now
         self._events: list[tuple[float, int, str, Value]] = []  # heap: time [s], order, input, value
         self._order = itertools.count()
+        self._expected: set[str] = set()
         inputs = [name for name, signal in signals.items() if not signal.is_output]
         for name, behavior in options.behaviors.items():
             if name not in inputs:
@@ -87,7 +89,19 @@ class SimulatedIo:
     async def read(self) -> Mapping[str, Value | Unreadable]:
         """Return all values at the current cell time."""
         self._advance()
-        return dict(self._values)
+        return {**self._values, **dict.fromkeys(self._expected, Unreadable("not yet reported by the simulated world"))}
+
+    def expect(self, names: Iterable[str]) -> None:
+        """Leave signals unreadable until the simulated world reports them; one with a behavior follows that."""
+        self._expected = set(names) - self._behaviors.keys()
+
+    def sense(self, state: IoState) -> None:
+        """Take inputs of the simulated world, and outputs at first."""
+        for signal in state.signals:
+            known = signal.direction == "output" and signal.name not in self._expected
+            if signal.value is not None and not known and signal.name not in self._behaviors:
+                self._values[signal.name] = signal.value
+            self._expected.discard(signal.name)
 
     def _advance(self) -> None:
         while self._events and self._events[0][0] <= self._now():
@@ -97,6 +111,7 @@ class SimulatedIo:
     async def write(self, name: str, value: Value) -> None:
         """Set an output; inputs that depend on it change at once or later."""
         self._advance()
+        self._expected.discard(name)
         before, self._values[name], now = self._values[name], value, self._now()
         for signal, behavior in self._behaviors.items():
             if behavior.follows == name and value != before:
