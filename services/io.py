@@ -12,7 +12,7 @@ from common import topics
 from common.config import Cups, Io, Tunable
 from common.control.signal_server import SignalServer
 from common.errors import ConfigError
-from common.hardware.interface import has_simulated_world
+from common.hardware.backends import has_simulated_world
 from common.hardware.signals import WorldSignals, load_io
 from common.messages import Message
 from common.process.service import main

@@ -19,7 +19,7 @@ from common.tasks.stages import AwaitImage, Command, DwellTimer, Execution, Grip
 V = TypeVar("V", bound=View)
 
 # Rejections that say nothing about the motion itself: the task decides again.
-NOT_ITS_FAULT = ("busy", "stale_request", "clock_ahead", "stopped", "not_owner", "too_late")
+NOT_ITS_FAULT = ("busy", "io_lost", "stale_request", "clock_ahead", "stopped", "not_owner", "too_late")
 MOST_FAILURES = 10
 PAUSE, LONGEST_PAUSE = 0.25, 2.0  # [s] after the second failure in a row; doubled with each further one
 OVERTIME = 30.0  # [s] a motion that takes this much longer than planned is stopped
