@@ -37,6 +37,11 @@ class Hole(Parameters):
     radius: Length = Field(0.003, description="of the search [m]")
     timeout: float = Field(80.0, gt=0, le=600, description="of one insertion [s]")
 
+    def has(self, place: Place, length: float) -> bool:
+        """Return whether a peg of this length [m] with its center at a place [m] is in the hole."""
+        x, y, z = self.position
+        return math.dist((x, y), place[:2]) < NEAR and place[2] - length / 2 < z - self.depth / 2
+
 
 class Config(HandlingConfig):
     """Parameters of the task."""
@@ -73,9 +78,7 @@ class Inserting(Handling):
             self.lack("no peg is seen", view)
 
     def _inserted(self, peg: m.CollisionObject) -> bool:
-        x, y, z = self.p.hole.position
-        px, py, pz = place_of(peg.pose)
-        return math.dist((x, y), (px, py)) < NEAR and pz - peg.dimensions[2] / 2 < z - self.p.hole.depth / 2
+        return self.p.hole.has(place_of(peg.pose), peg.dimensions[2])
 
     def destination(self, thing: m.CollisionObject, view: View) -> m.Pose | None:
         """Return the pose at the start of the insertion, with the configured errors."""

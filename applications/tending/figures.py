@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from applications.tending.parts import misplaced
+from applications.tending.task import PALLET
+from common.messages import WorldObjects
+from common.tasks.palletizing import Pattern
 from recording.report import application
 
 
@@ -12,3 +16,9 @@ class TendingFigures(application.Figures):
 
     COUNTED = "on the pallet"
     STATE_COLORS: ClassVar = {"GRASPING": "#2f7ed8", "PLACING": "#17a398", "HOMING": "#8d6cc2", "MACHINING": "#e0a030"}
+
+    def achieved(self, truth: WorldObjects) -> str:
+        """Return the number of parts in slots of the pallet."""
+        given = self.parameters.get("pallet")
+        wrong = misplaced(truth, PALLET if given is None else Pattern.model_validate(given))
+        return f"{len(truth.objects) - len(wrong)} of {len(truth.objects)} parts on the pallet"

@@ -14,7 +14,7 @@ from applications.tending.task import PALLET
 from common.config import ObjectConfig, Parameters, World
 from common.errors import ConfigError
 from common.messages import WorldObjects
-from common.tasks.palletizing import slot_at
+from common.tasks.palletizing import Pattern, slot_at, slots
 from common.tasks.stages import place_of
 
 ATTEMPTS = 200
@@ -51,9 +51,15 @@ def generate(world: World, options: Options, seed: int) -> list[ObjectConfig]:
     raise ConfigError("world.generator.count", options.count, f"parts do not fit {options.separation:g} m apart")
 
 
+def misplaced(truth: WorldObjects, pallet: Pattern) -> list[str]:
+    """Return the ids of parts without a slot of their own on a pallet, by ground truth: for evaluation only."""
+    every = slots(pallet)
+    taken = [slot_at(pallet, place_of(part.pose), every) for part in truth.objects]
+    return [part.id for part, slot in zip(truth.objects, taken, strict=True)
+            if slot is None or part.state != "table" or sum(slot == other for other in taken) > 1]
+
+
 def find_misplaced(truth: WorldObjects) -> str:
     """Return which parts are not in a slot of the default pallet, by ground truth: for evaluation only."""
-    taken = [slot_at(PALLET, place_of(part.pose)) for part in truth.objects]
-    wrong = [part.id for part, slot in zip(truth.objects, taken, strict=True)
-             if slot is None or sum(slot == other for other in taken) > 1]
+    wrong = misplaced(truth, PALLET)
     return f"not in a slot of the pallet: {', '.join(wrong)}" if wrong else ""

@@ -201,6 +201,11 @@ class Cell(Section):
         """The first part of every key."""
         return self.run.cell
 
+    @property
+    def task_parameters(self) -> dict[str, Any]:
+        """Parameters of the service that runs the task, as the cell file has them."""
+        return self.services[self.task].parameters if self.task in self.services else {}
+
     def _by_distance(self, arm: str) -> dict[str, Container]:
         """Return the containers of the world, the one nearest to the base of an arm first."""
         base = self.robots[arm].base_position[:2]

@@ -37,6 +37,7 @@ class RunAggregator:
         self, cell: str, application: Application | None, *, robot: RobotConfig | None = None, seed: int = 0,
         speed: float = 1.0, containers: Sequence[str] = (), history: RunHistory | None = None,
         listeners: Mapping[Topic[Any], Listener] | None = None, arms: Iterable[str] = (),
+        parameters: Mapping[str, Any] | None = None,
     ) -> None:
         """Start without messages.
 
@@ -50,8 +51,10 @@ class RunAggregator:
             history: to be filled as well, for a report.
             listeners: further listeners by topic, as for a verification.
             arms: names of the arms in a cell of several.
+            parameters: of the task in the cell file.
         """
         self.figures: Figures = figures_of(application)(robot, for_report=history is not None)
+        self.figures.parameters = parameters or {}
         self.summary = Summary(cell, seed, speed, self.figures, containers,
                                fills=application is not None and application.fills_containers)
         self.history = history

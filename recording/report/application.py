@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from common.application import Application
-from common.messages import PoseArray, TaskStatus
+from common.messages import PoseArray, TaskStatus, WorldObjects
 from common.topics import Topic
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ class Figures:
     COUNTED: ClassVar[str] = "done"  # label of what the task counts
     STATE_COLORS: ClassVar[Mapping[str, str]] = {}  # of task states in the timeline; the others get default colors
     TRUTH: ClassVar[Topic[PoseArray] | None] = None  # labelled positions, if world objects have no state
+    parameters: Mapping[str, Any] = {}  # of the task in the cell file
 
     def __init__(self, robot: RobotConfig | None = None, *, for_report: bool = False) -> None:
         """Start without messages.
@@ -68,6 +69,10 @@ class Figures:
         line = f"{summary['placed']} of {summary['targets']} {self.COUNTED}"
         return f"{line} (truth: {format_truth(summary['truth'])})" if summary["truth"] else line
 
+    def achieved(self, truth: WorldObjects) -> str:
+        """Return what was achieved by ground truth, in a few words; empty: where the objects are says it."""
+        return ""
+
     def facts(self, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         """Return names and values for the head of a report."""
         facts = [(self.COUNTED, f"{summary['placed']} of {summary['targets']}")]
@@ -94,9 +99,11 @@ def figures_of(application: Application | None) -> type[Figures]:
 
 
 def format_truth(truth: Mapping[str, Any]) -> str:
-    """Return the final positions of objects as "6 in the box, 1 on the table"."""
+    """Return what was achieved, or the final positions of objects as "6 in the box, 1 on the table"."""
+    if truth.get("achieved"):
+        return str(truth["achieved"])
     containers = truth["containers"]
-    parts = [f"{truth['in_box']} in the box"]
+    parts = [f"{truth['in_box']} in the box"] if containers or truth["in_box"] else []
     if len(containers) > 1:
         parts = [f"{count} in {name}" for name, count in containers.items()]
     parts.append(f"{truth['on_table']} on the table")

@@ -92,6 +92,7 @@ def build_report(recording: Recording, cell: str | None = None) -> str:
         recording.cell, _application_of(recording, resolved), robot=resolved.robot if resolved and robot else None,
         seed=run.seed or 0, speed=run.speed, history=history,
         containers=resolved.world.destinations if resolved else (),
+        parameters=resolved.task_parameters if resolved else None,
     )
     skipped = _aggregate(recording, run, aggregator)
     if not (aggregator.status or history.joint_states or history.services):

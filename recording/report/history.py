@@ -44,12 +44,14 @@ class Truth:
     """Newest ground truth of the objects."""
 
     containers: tuple[str, ...] = ()  # ids of those that objects are put into, if known
+    world: m.WorldObjects | None = None
     _objects: list[TrueObject] | None = None
     _labelled: list[TrueObject] | None = None
 
     def on_objects(self, message: m.WorldObjects) -> None:
         """Store the true objects of a message; old recordings lack their state and are ignored."""
         if all("state" in each.model_fields_set for each in message.objects):
+            self.world = message
             self._objects = [TrueObject(_xyz(each.pose), each.state, each.container) for each in message.objects]
 
     def on_labels(self, message: m.PoseArray) -> None:

@@ -181,7 +181,9 @@ class Summary:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of the summary file."""
-        rejected = self._all_rejected()
+        rejected, truth, world = self._all_rejected(), self.truth.counted(), self.truth.world
+        if truth is not None and world is not None and (achieved := self.figures.achieved(world)):
+            truth["achieved"] = achieved
         figures = self._before + self._now
         seconds = self._task_until - self._task_since if self._task_since is not None else 0.0
         return {
@@ -207,7 +209,7 @@ class Summary:
             "restarts": dict(self.restarts),
             "seed": self.seed,
             "speed": self.speed,
-            "truth": self.truth.counted(),
+            "truth": truth,
             "figures": dict(self.status.figures),
             "overlooked": self.status.overlooked,
             "unexplained": self.unexplained,

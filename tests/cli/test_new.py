@@ -14,7 +14,7 @@ KINDS = choices.task_kinds()
 
 
 def test_kinds_are_the_examples_with_a_cell_and_are_completed():
-    assert KINDS == ["palletize", "sort_cubes", "stack_cubes", "tending"]
+    assert KINDS == ["palletize", "sort_cubes", "stack_cubes"]
     found = dict(choices.tasks("st"))
     assert list(found) == ["stack_cubes"] and found["stack_cubes"].startswith("Stack cubes")
 
