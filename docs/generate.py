@@ -126,6 +126,7 @@ def writers() -> dict[str, str]:
             found.setdefault(key, {}).update(dict.fromkeys(services))
     return {**{key: ", ".join(services) for key, services in found.items()}, **shared,
             topics.IO_STATE.key: "io", topics.IO_SET.key: "io",  # of no included cell
+            topics.IO_SENSED.key: "trajectory_executor",
             topics.RESERVE.key: "arm_coordinator", topics.ARMS_STATUS.key: "arm_coordinator",
             topics.CONVEYOR_STATE.key: "trajectory_executor", topics.CONVEYOR_SET.key: "trajectory_executor",
             **dict.fromkeys(programs, "program_runner"),
