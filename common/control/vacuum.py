@@ -34,6 +34,7 @@ class VacuumCup:
         self.refusal, self.sealed, self.drawing = "", False, False
         self._wanted: bool | None = None  # value of the output by the newest command
         self._on = self._vacuum = False  # newest good values of output and input
+        self._came = False  # whether the input was on since the newest command
         self._since = -math.inf  # cell time of the newest command or change of the output [s]
         self._no_seal = ""  # of the simulated cup
 
@@ -60,7 +61,7 @@ class VacuumCup:
             owner, seen = self.request.owner, self.request.acknowledged
         if self._on is not wanted or self.order is not None:
             self.order = IoSet(signal=self._signals.output, value=wanted, owner=owner, acknowledged=seen)
-        self._wanted, self._since, self.refusal = wanted, now, ""
+        self._wanted, self._since, self.refusal, self._came = wanted, now, "", False
 
     def restore(self, width: float, now: float) -> None:
         """Let the simulated valve continue from the width before a restart [m]."""
@@ -92,10 +93,10 @@ class VacuumCup:
 
     def _take(self, on: bool, vacuum: bool, now: float) -> None:
         if on is not self._on:
-            self._since = now
+            self._since, self._came = now, False
             if on is not self._wanted and self.order is None:
                 self._wanted = None  # another client switched it
-        self._on, self._vacuum = on, vacuum
+        self._on, self._vacuum, self._came = on, vacuum, self._came or vacuum
         if on is not self.drawing:
             self.drawing = on
             self._command_valve(now)
@@ -112,7 +113,7 @@ class VacuumCup:
                     or f"{output} did not switch {'on' if self._wanted else 'off'} within {limit}")
         if self._on and not self._vacuum:
             why = f": {self._no_seal}" if self._no_seal else ""
-            return f"{vacuum} did not come within {limit}{why}"
+            return f"{vacuum} went off" if self._came else f"{vacuum} did not come within {limit}{why}"
         return f"{vacuum} did not end within {limit}" if self._vacuum and not self._on else ""
 
     def _released(self) -> str:

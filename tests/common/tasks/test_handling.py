@@ -92,6 +92,16 @@ def test_a_long_box_is_gripped_across_and_its_width_is_expected() -> None:
     assert [stage.expected_width for stage in stages if isinstance(stage, Grip) and stage.name == "close"] == [0.03]
 
 
+def test_cup_takes_the_top_face_of_a_box_wider_than_any_gripper() -> None:
+    robot = load_cell("panda", ["robot=ur5_cup"]).robot
+    wide = box("a", 0.5, 0.0, 0.4, (0.2, 0.15, 0.06), z=0.03)
+    decided = Decided(view(wide, q=list(robot.named_poses["home"])), task(robot=robot))
+    assert math.isclose(decided.pose("descend")[2, 3], 0.06) and decided.pose("descend")[2, 2] < -0.999
+    grips = [stage for stage in decided.stages if isinstance(stage, Grip)]
+    assert [(stage.width, stage.expected_width) for stage in grips] == [(0.08, None), (0.0, 0.04), (0.08, None)]
+    assert decided.move("descend").touches == [("cup_link", "a")]
+
+
 def test_nothing_is_chosen_before_the_objects_of_the_newest_image_are_confirmed() -> None:
     of, seen = task(), view(box("a", 0.5, 0.0))
     assert seen.scene is not None
