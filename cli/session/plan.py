@@ -159,9 +159,8 @@ def resolve(
     if no_viewer:
         loaded = without(loaded, [entry.name for entry in loaded.services.values() if entry.kind == VIEWER])
     aggregator = RunAggregator(
-        loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed,
-        speed=launch.clock.speed, containers=loaded.world.destinations, arms=loaded.robots,
-        parameters=loaded.task_parameters)
+        loaded.name, find_application(loaded.application), robot=loaded.robot, seed=loaded.run.seed, arms=loaded.robots,
+        speed=launch.clock.speed, containers=loaded.world.destinations, parameters=loaded.task_parameters)
     require_modules(loaded)
     require_safe(loaded)
     here = host.part_of(loaded)
