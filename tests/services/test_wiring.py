@@ -66,7 +66,7 @@ def test_only_camera_and_viewer_read_the_ground_truth_and_only_from_topics(cell:
 def test_every_known_topic_has_an_owner() -> None:
     owned = {topic for cell, name in SERVICES for topic in wired(cell)[name].owns}
     of_no_service = {topics.SUPERVISOR_STATUS, topics.LOG, topics.COUNTERS, topics.PARAMETERS, topics.MOTION_JOG,
-                     topics.IO_STATE, topics.IO_SET,  # no included cell has I/O
+                     topics.IO_STATE, topics.IO_SET, topics.IO_SENSED,  # no included cell has I/O
                      topics.RESERVE, topics.ARMS_STATUS, topics.CONVEYOR_STATE, topics.CONVEYOR_SET}  # arms, belts
     for each in applications():  # of other cells
         if all(each.name != cell.application for cell in CELLS.values()):
