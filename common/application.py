@@ -21,7 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
-from common.errors import ConfigError, UnknownName
+from common.errors import ConfigError
 from common.plugins import extend_path, find_plugin, import_from_working_directory, plugin_names
 
 if TYPE_CHECKING:  # these imports take too long for the command line and shell completion
@@ -204,8 +204,6 @@ def find_application(name: str) -> Application:
     """
     if not name:
         return Application()
-    if "." not in name and name not in application_names():
-        raise UnknownName("application", name, application_names())
     return _load(name)
 
 
