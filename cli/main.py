@@ -6,6 +6,7 @@ Each group of verbs is one file in this folder; heavy modules are imported when 
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import signal
 import sys
@@ -37,6 +38,7 @@ from tools import io_verbs
 from tools.payload import verbs as payload
 from tools.teleoperation.verbs import VERBS as TELEOPERATION
 
+built = functools.cache(lambda app, _applications: typer.main.get_command(app))  # once for all commands of a process
 NO_HOME = "Could not determine home directory."  # pathlib's error for ~NAME/...
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
@@ -54,7 +56,7 @@ class CommandLine(CommandGroup):
         choices.prepare()
         try:
             of_applications.take_own(arguments)
-            command, given = typer.main.get_command(self), options.with_optional_values(arguments)
+            command, given = built(self, len(of_applications.known)), options.with_optional_values(arguments)
             code = command(given, standalone_mode=False, prog_name="zencell", obj=verbs.CommandShell())
         except typer.TyperException as error:
             code = _fail(_with_choices(error), error.exit_code)

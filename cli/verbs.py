@@ -89,7 +89,7 @@ class ApplicationVerbs:
             last: the parameter of `run` before which the help lists these options.
         """
         self._app, self._groups, self._run, self._last = app, groups, run, last
-        self._known: set[str] = set()
+        self.known: set[str] = set()
 
     def take_all(self) -> None:
         """Add the verbs and options of the built-in applications."""
@@ -104,9 +104,9 @@ class ApplicationVerbs:
 
     def take(self, application: Application) -> None:
         """Add the verbs and options of one application once."""
-        if application.name in self._known:
+        if application.name in self.known:
             return
-        self._known.add(application.name)
+        self.known.add(application.name)
         if application.verbs is not None:
             self.take_verbs(application.verbs)
 
