@@ -104,11 +104,9 @@ class ApplicationVerbs:
 
     def take(self, application: Application) -> None:
         """Add the verbs and options of one application once."""
-        if application.name in self.known:
-            return
-        self.known.add(application.name)
-        if application.verbs is not None:
+        if application.name not in self.known and application.verbs is not None:
             self.take_verbs(application.verbs)
+        self.known.add(application.name)
 
     def take_verbs(self, verbs: Verbs) -> None:
         """Add commands and options."""

@@ -42,9 +42,7 @@ def pytest_unconfigure() -> None:
     shutil.rmtree(STATE_ROOT, ignore_errors=True)
 
 
-LAST = "tests/common/"  # many short tests
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with long tests: `make test` assigns the files to two workers in this order."""
-    items.sort(key=lambda item: item.nodeid.startswith(LAST))
+    """Start with files of long tests, end with tests/common: two workers get the files in this order."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: (item.path not in slow, item.nodeid.startswith("tests/common/")))

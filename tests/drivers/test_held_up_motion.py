@@ -5,7 +5,7 @@ import pytest
 
 from tests.drivers.held_up_arm import HeldUpArm
 
-SLIDERS = [(1.0, 0.0, 1.0), (1.0, 0.02, 1.0), (1.0, 0.3, 1.0), (1.0, 0.0, 0.02, 0.5, 1.0), (0.3, 1.0, 0.05, 0.0, 1.0)]
+SLIDERS = [(1.0, 0.0, 0.02, 0.5, 1.0), (0.3, 1.0, 0.05, 0.0, 1.0)]
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def test_moved_speed_slider_slows_the_arm_without_a_protective_stop(arm, sequenc
     assert jogs or (arm.status.state == "succeeded" and np.allclose(arm.arm.q, 1.2, atol=1e-3))
 
 
-@pytest.mark.parametrize("slider", [1.0, 0.3, 0.02, 0.0])
+@pytest.mark.parametrize("slider", [1.0, 0.02, 0.0])
 @pytest.mark.parametrize("after", [0.05, 0.6], ids="{} s after the slider".format)
 def test_stop_is_not_delayed_by_a_low_slider(arm, slider, after):
     arm.move(1.2, 4.0)
@@ -57,7 +57,7 @@ def test_stop_is_not_delayed_by_a_low_slider(arm, slider, after):
 
 @pytest.mark.parametrize("jogs", [False, True], ids=["motion", "jog"])
 @pytest.mark.parametrize("who", ["driver", "executor"])
-@pytest.mark.parametrize(("freeze", "continues"), [(0.04, True), (0.06, True), (0.22, False)])
+@pytest.mark.parametrize(("freeze", "continues"), [(0.06, True), (0.22, False)])
 def test_motion_continues_after_a_short_freeze_only(monkeypatch, who, freeze, continues, jogs):
     arm = HeldUpArm(monkeypatch, ahead=0.05)
     if jogs:

@@ -19,7 +19,7 @@ print(Simulation(load_cell(sys.argv[1], sys.argv[3:]), int(sys.argv[2]), digest=
 """
 
 
-@pytest.mark.parametrize("count", [3, pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [2, pytest.param(7, marks=pytest.mark.slow)])
 def test_panda_clears_the_table(count):
     summary = SimulatedCell("panda", [f"world.count={count}"]).summary
     assert (summary["state"], summary["placed"], summary["targets"], summary["rejected"]) == ("DONE", count, count, [])
