@@ -53,6 +53,7 @@ class Outcome:
     distance: float = np.inf
     judged: int = 0
     refused: int = 0
+    replaced: int = 0  # places that an arm at home blocks
     retreats: int = 0
     unfinished: int = 0
     gap: float = 0.0
@@ -76,7 +77,11 @@ def place(robot: RobotModel, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def task(seed: int, turns: bool, judge: bool) -> Outcome:
-    """Let both arms pick and place; a motion that is refused for a retreat is requested again from where the arm is."""
+    """Let both arms pick and place.
+
+    A motion that is refused for a retreat is requested again from where the arm is; a place that the other arm blocks
+    even at home is replaced by another one.
+    """
     rng = np.random.default_rng(seed)
     sim = TwoArms(Options(turns=turns), seed=seed)
     outcome, stages, pauses = Outcome(seed), dict[str, list[list[Array]]](), dict[str, float]()
@@ -95,6 +100,10 @@ def task(seed: int, turns: bool, judge: bool) -> Outcome:
                     last[name] = stages[name][0][0]
                     stages[name].pop(0)
                     pauses[name] = sim.now + 0.5  # the fingers move
+                elif result.error == "blocked" and len(stages[name]) > 1:
+                    outcome.replaced += 1
+                    stages[name][0] = [*place(arm.robot, rng)]
+                    pauses[name] = sim.now + 0.3
                 else:
                     outcome.refused += result.error not in ("retreats", "busy")
                     pauses[name] = sim.now + 0.3
@@ -207,6 +216,7 @@ def main() -> None:
           f"contacts {sum(one.distance <= 0 for one in at_once)} in {sum(one.judged for one in at_once)} states; "
           f"least distance {min(one.distance for one in at_once):.4f} m")
     print(f"unfinished {sum(one.unfinished > 0 for one in at_once)}, refused {sum(one.refused for one in at_once)}, "
+          f"places replaced {sum(one.replaced for one in at_once)}, "
           f"retreats {sum(one.retreats for one in at_once)}, largest gap of schedules "
           f"{max(one.gap for one in at_once):.3f} s")
     print(f"makespan in turns / at once: mean {np.mean(ratios):.2f}, 5 to 95 % "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from common.hardware.interface import Limits
 from common.planning.arms import way_back
 from common.planning.arms.band import Delays
 from common.planning.arms.pair_world import ArmBody, ArmGeometry
-from common.planning.arms.proofs import SAME_POSE, Moving
+from common.planning.arms.proofs import SAME_POSE, Moving, resting
 from common.planning.arms.timed_pairs import ArmMotion, Schedule
 from common.planning.trajectory import TimedPath
 
@@ -67,6 +68,13 @@ class Ticket:
     possible: bool = False  # it was proved against the home poses of all other arms
     reason: str = ""
     waits_for: set[str] = field(default_factory=set)
+    ways: tuple[TimedPath | None, Moving, Moving | None] | None = None  # way back from its start; straight, reversed
+
+    @cached_property
+    def end(self) -> Moving:
+        """Pose at rest after its motion; one object, so that proofs with it continue in the next step."""
+        assert self.moving is not None
+        return resting(self.moving.body, self.moving.motion.end)
 
 
 @dataclass(eq=False)
@@ -74,6 +82,7 @@ class Committed:
     """A motion that may run.
 
     Attributes:
+        end: pose at rest after it.
         back: way back from its end, with what the arm carries.
         before: way back from its start.
         parked_for: arms that move on while this one waits, held, at a proved place.
@@ -82,6 +91,7 @@ class Committed:
     goal: str
     moving: Moving
     schedule: Schedule
+    end: Moving
     back: Moving | None
     before: TimedPath | None
     since: float
@@ -106,7 +116,7 @@ class Arm:
         self.limits = Limits(tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration,
                              deceleration, robot.jerk)
         self.body: ArmBody = geometry.body()
-        self.home = Moving(self.body, ArmMotion.resting(geometry.home))
+        self.home = resting(self.body, geometry.home)
         self.state: Observed | None = None
         self.rest: Moving = self.home
         self.rest_since = 0.0
@@ -118,14 +128,19 @@ class Arm:
     @property
     def end(self) -> Moving:
         """Pose at rest, now or after its committed motion."""
-        if self.committed is None:
-            return self.rest
-        if self._end is None or self._end[0] is not self.committed:
-            self._end = self.committed, Moving(
-                self.committed.moving.body, ArmMotion.resting(self.committed.motion.end))
-        return self._end[1]
+        return self.rest if self.committed is None else self.committed.end
 
-    _end: tuple[Committed, Moving] | None = None
+    @property
+    def here(self) -> Moving:
+        """Pose on its committed motion, while it is held there."""
+        assert self.committed is not None
+        q = self.committed.motion.at(self.done)
+        if self._here is None or self._here.body is not self.committed.moving.body or (
+                np.abs(q - self._here.motion.end).max() > 0):
+            self._here = resting(self.committed.moving.body, q)
+        return self._here
+
+    _here: Moving | None = None
 
     @property
     def way_back(self) -> Moving | None:
@@ -137,7 +152,7 @@ class Arm:
         if self.rest.body is self.body and np.abs(q - self.rest.motion.end).max() <= SAME_POSE:
             return
         moved = np.abs(q - self.rest.motion.end).max() > SAME_POSE
-        self.rest = Moving(self.body, ArmMotion.resting(q))
+        self.rest = resting(self.body, q)
         if moved:
             self.rest_since = now
         if self.back is not None and np.abs(q - self.back.motion.start).max() > way_back.CLOSE:

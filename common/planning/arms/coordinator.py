@@ -188,10 +188,13 @@ class Coordinator:
 
     def _line_home(self, arm: Arm, at: Moving) -> Moving | None:
         """Return the straight way home, if the scene of the arm is known to be free there."""
-        q, home = at.motion.end, arm.geometry.home
-        if np.abs(q - home).max() > way_back.CLOSE and (self._line is None or not self._line(arm.name, q, home)):
-            return None
-        return Moving(at.body, ArmMotion(way_back.straight(q, home, arm.limits)))
+        line = _line(arm, at)
+        return line if self._is_free(arm, line) else None
+
+    def _is_free(self, arm: Arm, line: Moving) -> bool:
+        q, home = line.motion.start, line.motion.end
+        return bool(np.abs(q - home).max() <= way_back.CLOSE) or (
+            self._line is not None and self._line(arm.name, q, home))
 
     def _try(self, arm: Arm, waiting: list[Arm], now: float) -> None:
         """Commit the waiting motion of an arm if that is proved; else set what it waits for."""
@@ -229,37 +232,35 @@ class Coordinator:
                 self.alone, arm.ticket = (arm.name, ticket.goal, now), None
             return
         for each in older:
-            if not self._may_overtake(arm, ticket.moving, each, now):
+            if not self._may_overtake(arm, ticket.end, each, now):
                 ticket.waits_for.add(each.name)
                 ticket.reason = f"the older request of {each.name} is first"
         if not ticket.waits_for:
             self._commit(arm, ticket, ticket.moving, now)
 
-    def _may_overtake(self, arm: Arm, moving: Moving, older: Arm, now: float) -> bool:
-        """Return whether the older request can start as soon as this motion is over."""
+    def _may_overtake(self, arm: Arm, end: Moving, older: Arm, now: float) -> bool:
+        """Return whether the older request can start as soon as an arm is at its end."""
         ticket = older.ticket
         assert ticket is not None
         if ticket.moving is None or now - ticket.first > self.options.overtaken:
             return False
         if arm.name not in ticket.waits_for:
             return True  # it waits for others only; with two arms this does not occur
-        end = Moving(moving.body, ArmMotion.resting(moving.motion.end))
         return self.proofs.anywhere(ticket.moving, end) is None
 
     def _commit(self, arm: Arm, ticket: Ticket, moving: Moving, now: float) -> None:
         delays, state = self.options.delays, arm.state
         rate = 1.0 if state is None else max(state.scaling, 0.05)
         schedule = Schedule(now + delays.message + AFTER_RELEASE * rate, rate)
-        end = Moving(moving.body, ArmMotion.resting(moving.motion.end))
         before = arm.back.motion.path if arm.back is not None else None
         braking = braking_time(moving.motion.path, arm.limits)
         for other in self._others(arm):
-            if reason := self._conflict(moving, schedule, end, braking, other, now):
+            if reason := self._conflict(moving, schedule, ticket.end, braking, other, now):
                 ticket.waits_for.add(other.name)
                 ticket.reason = reason
         if ticket.waits_for:
             return
-        back = self._way_back(arm, moving, end, before)
+        back = self._way_back(arm, ticket, moving, before)
         if back is None and self.proofs.exhausted:
             ticket.reason = UNFINISHED
             return
@@ -272,7 +273,7 @@ class Coordinator:
                 ticket.reason = f"no way back from its end is proved while {' and '.join(blockers)} is there"
             return
         frozen = {other.name for other in self._others(arm) if other.is_frozen or other.hold}
-        arm.committed = Committed(ticket.goal, moving, schedule, back, before, now, braking)
+        arm.committed = Committed(ticket.goal, moving, schedule, ticket.end, back, before, now, braking)
         arm.ticket, arm.hold = None, ""
         for name in frozen:
             if (run := self.arms[name].committed) is not None:
@@ -307,12 +308,13 @@ class Coordinator:
         return self.proofs.anywhere(moving, run.moving, rest_of, (done - PAST, reach)) or self.proofs.anywhere(
             end, run.moving, None, (done - PAST, run.motion.duration))
 
-    def _way_back(self, arm: Arm, moving: Moving, end: Moving, before: TimedPath | None) -> Moving | None:
+    def _way_back(self, arm: Arm, ticket: Ticket, moving: Moving, before: TimedPath | None) -> Moving | None:
         """Return a way back from the end of a motion that is free while the other arms are at their ends or home."""
-        behind = way_back.behind(moving.motion.path, before)
-        candidates = [self._line_home(arm, end)]
-        candidates += [] if behind is None else [Moving(moving.body, ArmMotion(behind))]
-        for back in candidates:
+        if ticket.ways is None or ticket.ways[0] is not before:
+            path = way_back.behind(moving.motion.path, before)
+            ticket.ways = before, _line(arm, ticket.end), None if path is None else Moving(moving.body, ArmMotion(path))
+        line, behind = ticket.ways[1:]
+        for back in (line if self._is_free(arm, line) else None, behind):
             if back is not None and not any(
                     self.proofs.anywhere(back, other.end) or self.proofs.anywhere(back, other.home)
                     for other in self._others(arm)):
@@ -353,6 +355,10 @@ class Coordinator:
         arm.rest_since = now  # another attempt follows after the patience
         return [Retreat(arm.name, f"{RETREAT}{self._retreats}", arm.back.motion.path,
                         f"out of the way of {for_arm.name}")]
+
+
+def _line(arm: Arm, at: Moving) -> Moving:
+    return Moving(at.body, ArmMotion(way_back.straight(at.motion.end, arm.geometry.home, arm.limits)))
 
 
 def _named(clash: Clash) -> str:

@@ -32,6 +32,11 @@ class Moving:
         return self.body.arm.name
 
 
+def resting(body: ArmBody, q: Array) -> Moving:
+    """Return a body at rest at q (dof,) [rad]."""
+    return Moving(body, ArmMotion.resting(q))
+
+
 class Proofs:
     """Creates a proof for each pair of motions when it is needed first; the newest are remembered."""
 

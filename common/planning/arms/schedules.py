@@ -13,8 +13,7 @@ from itertools import combinations
 from common.planning.arms.arm import Arm
 from common.planning.arms.band import AFTER_RELEASE
 from common.planning.arms.coordinator import PAST, Coordinator, Retreat
-from common.planning.arms.proofs import Moving
-from common.planning.arms.timed_pairs import NOT_AT_REST, ArmMotion, Schedule
+from common.planning.arms.timed_pairs import NOT_AT_REST, Schedule
 
 RETRY = 0.1  # [s] between attempts to prove new schedules
 LEAST_RATE = 0.05
@@ -145,8 +144,6 @@ class ScheduleKeeper:
 
     def _would_clash(self, resting: Arm, held: Arm) -> bool:
         """Return whether the way back of an arm at rest is not free while another one is held on its path."""
-        assert held.committed is not None
         if resting.back is None:
             return True
-        at = Moving(held.committed.moving.body, ArmMotion.resting(held.committed.motion.at(held.done)))
-        return self._all.proofs.anywhere(resting.back, at) is not None
+        return self._all.proofs.anywhere(resting.back, held.here) is not None

@@ -33,6 +33,15 @@ def test_an_arm_at_rest_that_obstructs_an_older_request_moves_back() -> None:
     assert min(sim.judged()) > 0.0
 
 
+def test_proofs_that_take_longer_than_a_step_continue_in_the_next_one() -> None:
+    sim = TwoArms(Options(effort=2))
+    sim.execute("left", "in", sim.path_to("left", middle(sim, "left")))
+    sim.run(10.0)
+    sim.execute("right", "other", sim.path_to("right", middle(sim, "right")))
+    sim.run(20.0)
+    assert sim.results["in"].state == sim.results["other"].state == "succeeded"
+
+
 def test_an_arm_follows_one_that_leaves_before_that_has_come_to_rest() -> None:
     sim = both_to_the_middle()
     sim.run(0.5)
