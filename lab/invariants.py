@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
+from itertools import combinations
 from typing import Any
 
 import msgpack
+import numpy as np
 
 from common import topics
 from common.application import find_application
+from common.arms import arm_of, of_arm
 from common.config import Cell
 from common.hardware.interface import Limits, Vector
 from common.messages import (
@@ -26,13 +29,16 @@ from common.messages import (
     PlanRequest,
     PointCloud2,
     ServiceCounters,
+    StopRequest,
     WorldEdit,
     WorldObjects,
 )
+from common.robot.model import RobotModel
 from common.topics import AnyTopic
 from common.transport.codec import decode
 from common.transport.local import intersects
 from common.transport.session import RawSample
+from lab.arm_distance import ArmDistance
 from lab.doubles import is_double
 from lab.motion_invariants import ONCE, Checks, MotionInvariants
 from lab.processes import RequestLog
@@ -42,6 +48,7 @@ Position = tuple[float, float, float]  # x, y, z [m]
 WITH_ID = (ExecuteRequest, GripperCommand, PlanRequest)
 PUBLISHED_BY_CAMERAS = (Image, CameraInfo, PointCloud2, ServiceCounters, LogLine)  # by readers of the ground truth
 LATE = 0.5  # [s] that the end of a request may come after its time-out
+MEASURED = 0.02  # [rad] of a joint from which the distance between arms is measured again
 MOVED = 2e-3  # [m] displacement from which an object counts as moved
 CARRIED, CONTAINED, LOST = ("held", "falling"), "contained", "elsewhere"  # states of an object in the ground truth
 
@@ -51,6 +58,7 @@ TRUTH = "no deciding service reads the ground truth"
 OUTCOMES = "every request ends in one of five ways"
 NEWER = "no message is read twice or out of order"
 COUNTED = "the task counts what was placed"
+APART = "arms do not touch"
 ACCEPTED = "the application accepts the final state"
 
 
@@ -121,6 +129,29 @@ class WorldInvariants:
                 checks.add_violation(ACCEPTED, problem)
 
 
+class BetweenArms:
+    """Checks that the set-points of two arms do not touch."""
+
+    def __init__(self, checks: Checks, cell: Cell) -> None:
+        self._checks = checks
+        robots = {arm: RobotModel.load(robot) for arm, robot in cell.robots.items()}
+        self._judges = {pair: ArmDistance(robots[pair[0]], robots[pair[1]]) for pair in combinations(robots, 2)}
+        self._newest: dict[str, Vector] = {}
+        self._measured: dict[str, Vector] = {}
+
+    def on_set_point(self, arm: str, q: Vector) -> None:
+        """Measure once a joint has moved by `MEASURED`."""
+        self._newest[arm] = q
+        if arm in self._measured and np.abs(q - self._measured[arm]).max() < MEASURED:
+            return
+        self._measured[arm] = q.copy()
+        for pair, judge in self._judges.items():
+            if arm in pair and all(each in self._newest for each in pair):
+                distance = judge.least(*(self._newest[each] for each in pair))
+                if self._checks.fails(distance > 0, APART):
+                    self._checks.add_violation(APART, f"{' and '.join(pair)}: {distance:.4f} m")
+
+
 class Invariants:
     """Checks all messages, set-points and requests of one run.
 
@@ -132,12 +163,12 @@ class Invariants:
         self.checks = checks = Checks(now)
         self.finished = False  # ignore set-points from now on
         self.truth_readers: set[str] = set()  # processes that subscribe to what only cameras may read
-        self.motion = MotionInvariants(checks, cell)
-        self._several = bool(cell.robots)  # set-points do not say of which arm they are
+        self._motions = {arm: MotionInvariants(checks, cell, arm) for arm in cell.robots or ("",)}
+        self._between = BetweenArms(checks, cell)
         self._world = WorldInvariants(checks, cell)
         self._requests = requests
         requests.on_request, requests.on_answer = self._on_request, self._on_answer
-        requests.on_serve = self.motion.on_serve
+        requests.on_serve = self._on_serve
         application = find_application(cell.application)
         self._doubles = {entry.name for entry in cell.services.values() if is_double(entry)}
         known: dict[str, AnyTopic] = {**topics.platform_topics(), **application.topics_by_key}
@@ -145,9 +176,9 @@ class Invariants:
         self._objects_key = f"{cell.name}/{topics.SCENE_OBJECTS.key}"
         self._truth_keys = [self._objects_key, *(f"{cell.name}/{view.key}" for view in application.truth_views)]
         self._log_part = f"/{topics.LOG.expression.partition('/')[0]}/"
-        self._motion_key = f"{cell.name}/{topics.MOTION_STATUS.key}"
-        self._gripper_key = f"{cell.name}/{topics.GRIPPER_STATE.key}"
-        self._owner_key = f"{cell.name}/{topics.MOTION_OWNER.key}"
+        self._of_motion = {f"{cell.name}/{of_arm(topic, arm).key}": (topic, motion) for arm, motion in
+                           self._motions.items() for topic in (topics.MOTION_STATUS, topics.GRIPPER_STATE,
+                                                               topics.MOTION_OWNER)}
         self._by_id: dict[str, Message] = {}  # requests
         self._publishing: dict[str, str] = {}  # by service: the process that published last
         self._replaced: dict[str, str] = {}  # processes that another one has replaced, which is the value
@@ -193,36 +224,64 @@ class Invariants:
             model = self._messages.get(sample.encoding.rpartition(";")[2], Message)
             if checks.fails(issubclass(model, PUBLISHED_BY_CAMERAS), TRUTH):
                 checks.add_violation(TRUTH, f"{service} reads it and publishes {sample.key}")
-        if sample.key == self._motion_key:
-            self.motion.on_motion(instance, decode(MotionStatus, sample.payload))
-        elif sample.key == self._gripper_key:
-            self.motion.on_gripper(instance, decode(GripperState, sample.payload))
-        elif sample.key == self._owner_key:
-            self.motion.jogging = decode(MotionOwner, sample.payload).jogging
+        if sample.key in self._of_motion:
+            topic, motion = self._of_motion[sample.key]
+            message = decode(topic.message, sample.payload)
+            if isinstance(message, MotionStatus):
+                motion.on_motion(instance, message)
+            elif isinstance(message, GripperState):
+                motion.on_gripper(instance, message)
+            elif isinstance(message, MotionOwner):
+                motion.jogging = message.jogging
         elif sample.key == self._objects_key:
             self._world.on_truth(sample.payload)
 
-    def on_set_point(self, limits: Limits, measured: Vector, q: Vector, dq: Vector, now: float) -> None:
-        """Check a set-point; see `MotionInvariants.on_set_point`."""
-        if not self.finished and not self._several:
-            self.motion.on_set_point(limits, measured, q, dq, now)
+    def on_set_point(
+        self, limits: Limits, measured: Vector, q: Vector, dq: Vector, now: float, arm: str = ""
+    ) -> None:
+        """Check a set-point of an arm; see `MotionInvariants.on_set_point`."""
+        if not self.finished:
+            self._motions[arm].on_set_point(limits, measured, q, dq, now)
+            self._between.on_set_point(arm, q)
+
+    @property
+    def stopped_by_operator(self) -> bool:
+        """Whether the newest command of an operator to an arm was to stop, pause or hold."""
+        return any(motion.stopped_by_operator for motion in self._motions.values())
+
+    def on_clock(self, step: float) -> None:
+        """Shift all cell times; see `MotionInvariants.on_clock`."""
+        for motion in self._motions.values():
+            motion.on_clock(step)
 
     # --- requests -----------------------------------------------------------------------------------------------------
 
-    def _on_request(self, service: str, request: Message) -> None:
+    def _arms(self, key: str) -> list[MotionInvariants]:
+        """Return the arm that a request is for, or all for a key that they share."""
+        arm = arm_of(key, self._motions)
+        return [self._motions[arm]] if arm in self._motions else [*self._motions.values()]
+
+    def _on_serve(self, instance: str, request: Message, answer: Message, key: str = "") -> None:
+        for motion in self._arms(key):
+            motion.on_serve(instance, request, answer)
+
+    def _on_request(self, service: str, request: Message, key: str = "") -> None:
         if isinstance(request, WITH_ID):
             known = self._by_id.setdefault(request.id, request)
             if self.checks.fails(known is request or known == request, ONCE):
                 self.checks.add_violation(ONCE, f"{request.id} is the id of two different requests: "
                                           f"{type(known).__name__} and {type(request).__name__}")
-        self.motion.on_request(service, request)
+        stops_all = isinstance(request, StopRequest) and bool(request.owner)
+        for motion in self._arms("" if stops_all else key):
+            motion.on_request(service, request)
         if isinstance(request, WorldEdit):
             self._world.on_edit_requested()
 
-    def _on_answer(self, service: str, request: Message, answer: Message) -> None:
+    def _on_answer(self, service: str, request: Message, answer: Message, key: str = "") -> None:
         if isinstance(request, WorldEdit):
             self._world.on_edit_answered()
-        self.motion.on_answer(service, request, answer)
+        for motion in self._arms(key):
+            motion.on_answer(service, request, answer)
 
     def check_requests(self) -> None:
         """Check open requests for their deadlines, and report what the request log found."""

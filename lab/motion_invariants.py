@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common import topics
+from common.arms import of_arm
 from common.config import Cell
 from common.hardware.interface import Limits, Vector
 from common.messages import (
@@ -80,13 +81,13 @@ class _Goals:
 class MotionInvariants:
     """Checks goals, set-points, stops and speed limits."""
 
-    def __init__(self, checks: Checks, cell: Cell) -> None:
+    def __init__(self, checks: Checks, cell: Cell, arm: str = "") -> None:
         self.jogging = False  # whether the arm is jogged
         self.last_command = ""  # newest command of an operator to the task, or "stop" to the executor
         self._checks = checks
         self._cycle = CYCLES / control_rate(cell)  # [s] of cell time
-        self._motion = f"{cell.name}/{topics.MOTION_STATUS.key}"
-        self._gripper = f"{cell.name}/{topics.GRIPPER_STATE.key}"
+        self._motion = f"{cell.name}/{of_arm(topics.MOTION_STATUS, arm).key}"
+        self._gripper = f"{cell.name}/{of_arm(topics.GRIPPER_STATE, arm).key}"
         self._goals: dict[str, _Goals] = {}
         self._ended: dict[tuple[str, str], str] = {}  # end state by key and goal
         self._requested_at: dict[str, float] = {}  # virtual time of the first request by goal [s]

@@ -21,7 +21,8 @@ from recording.sample import Sample, message_of
 from recording.writer import RUN, RecordingWriter, run_of
 
 simulated = True  # this module is a hardware backend
-OnSetPoint = Callable[[Limits, Vector, Vector, Vector, float], None]  # measured q, commanded q [rad], dq, cell time [s]
+# limits, measured q, commanded q [rad], dq, cell time [s], name of the arm
+OnSetPoint = Callable[[Limits, Vector, Vector, Vector, float, str], None]
 FLUSH_NS = 800_000_000  # of virtual time
 
 
@@ -30,6 +31,7 @@ class Options(Parameters):
 
     backend: str
     options: dict[str, Any]
+    arm: str = ""  # in a cell of several
 
 
 class _Observer:
@@ -39,8 +41,8 @@ class _Observer:
 class ObservedArm:
     """Arm that passes every set-point to the observer and on to the simulated arm below."""
 
-    def __init__(self, below: Hardware, limits: Limits) -> None:
-        self._below, self._limits = below, limits
+    def __init__(self, below: Hardware, limits: Limits, arm: str) -> None:
+        self._below, self._limits, self._arm = below, limits, arm
         self._measured: Vector | None = None
         self.gripper: Gripper | None = below.gripper
 
@@ -54,7 +56,7 @@ class ObservedArm:
         """Show a set-point to the observer and pass it on."""
         if _Observer.on_set_point is not None:
             measured = positions if self._measured is None else self._measured
-            _Observer.on_set_point(self._limits, measured, positions, velocities, now)
+            _Observer.on_set_point(self._limits, measured, positions, velocities, now, self._arm)
         self._below.write(positions, velocities, now)
 
     def close(self) -> None:
@@ -77,14 +79,14 @@ class ObservedSensor(ObservedArm):
         return self._below.wrench()
 
 
-def _around(below: Hardware, limits: Limits) -> ObservedArm:
-    return (ObservedSensor if isinstance(below, SensingArm) else ObservedArm)(below, limits)
+def _around(below: Hardware, limits: Limits, arm: str) -> ObservedArm:
+    return (ObservedSensor if isinstance(below, SensingArm) else ObservedArm)(below, limits, arm)
 
 
 def create(robot: RobotConfig, limits: Limits, start: Vector, options: Options) -> ObservedArm:
     """Return an observed arm around the configured backend."""
     below = robot.model_copy(update={"hardware": HardwareConfig(backend=options.backend, options=options.options)})
-    return _around(load_hardware(below, limits, start), limits)
+    return _around(load_hardware(below, limits, start), limits, options.arm)
 
 
 def around(
@@ -92,24 +94,25 @@ def around(
 ) -> ObservedArm:
     """Return an observed arm around the arm of a simulated world, which replaces the configured backend."""
     below = robot.model_copy(update={"hardware": HardwareConfig(backend=options.backend, options=options.options)})
-    return _around(load_hardware(below, limits, start, arm), limits)
+    return _around(load_hardware(below, limits, start, arm), limits, options.arm)
 
 
 def with_observed_arm(cell: Cell) -> Cell:
-    """Return the cell with an observed arm.
+    """Return the cell with observed arms.
 
     Raises:
         ConfigError: its arm is real, so it cannot run on virtual time.
     """
-    robots = {arm: _observed(robot) for arm, robot in cell.robots.items()}
+    robots = {arm: _observed(robot, arm) for arm, robot in cell.robots.items()}
     return cell.model_copy(update={"robot": _observed(cell.robot), "robots": robots})
 
 
-def _observed(robot: RobotConfig) -> RobotConfig:
+def _observed(robot: RobotConfig, arm: str = "") -> RobotConfig:
     hardware = robot.hardware
     if not find_backend(robot).simulated:  # a backend that talks to an arm has a clock of its own
         raise ConfigError("robot.hardware.backend", hardware.backend, "is a real arm: simulate needs a simulated one")
-    observed = HardwareConfig(backend=__name__, options={"backend": hardware.backend, "options": hardware.options})
+    options = {"backend": hardware.backend, "options": hardware.options, "arm": arm}
+    observed = HardwareConfig(backend=__name__, options=options)
     return robot.model_copy(update={"hardware": observed})
 
 

@@ -62,9 +62,9 @@ class RequestLog:
     read: int = 0  # messages
     started: int = 0
     on_start: Callable[[str, str, str], None] = lambda client, server, key: None
-    on_request: Callable[[str, Message], None] = lambda service, request: None
-    on_serve: Callable[[str, Message, Message], None] = lambda instance, request, answer: None
-    on_answer: Callable[[str, Message, Message], None] = lambda service, request, answer: None
+    on_request: Callable[[str, Message, str], None] = lambda service, request, key: None
+    on_serve: Callable[[str, Message, Message, str], None] = lambda instance, request, answer, key: None
+    on_answer: Callable[[str, Message, Message, str], None] = lambda service, request, answer, key: None
 
 
 class _LoggedClient(Client[Q, A]):
@@ -76,7 +76,7 @@ class _LoggedClient(Client[Q, A]):
         """Return the answer to a request."""
         requests = self.requests
         requests.on_start(self._service, self.server, self.topic.key)
-        requests.on_request(self._service, request)
+        requests.on_request(self._service, request, self.topic.key)
         number = requests.started = requests.started + 1
         requests.open[number] = self._service, self.topic.key, monotonic() + timeout
         try:
@@ -94,7 +94,7 @@ class _LoggedClient(Client[Q, A]):
         finally:
             requests.open.pop(number, None)
         requests.outcomes["answered"] += 1
-        requests.on_answer(self._service, request, answer)
+        requests.on_answer(self._service, request, answer, self.topic.key)
         return answer
 
 
@@ -144,10 +144,11 @@ class SimulatedBus(Bus):
 
     def serve(self, topic: Request[Q, A], handler: Callable[[Q], Awaitable[A]], **how: Any) -> None:
         """Answer requests and log the answers."""
+        key = self._remapping.key(topic.key)
 
         async def logged(request: Q) -> A:
             answer = await handler(request)
-            self._requests.on_serve(self.session.instance, request, answer)
+            self._requests.on_serve(self.session.instance, request, answer, key)
             return answer
 
         super().serve(topic, logged, **how)

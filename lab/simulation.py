@@ -47,6 +47,7 @@ VISITOR = "visitor"
 UNCHECKED = (VISITOR, STRANGER)  # may publish anything, malformed messages included
 ENDED, LEFT = ("DONE", "ERROR"), "LEFT"
 SOONER = 0.5  # factor on the time of faults in a cell with doubles, whose task takes half as long
+OPERATOR_FAULTS = ("operator", "operator stop", "speed change", "late start", "abandoned goal", "takeover")
 LEFT_OUT = ("viewer",)  # a page in a browser cannot run on virtual time
 
 Visit = Callable[[Bus], Coroutine[Any, Any, None]]
@@ -109,6 +110,8 @@ class Simulation:
         names = [entry.name for entry in services.values()]
         doubled = any(is_double(entry) for entry in services.values())
         self.plan = make_plan(seed, names, SOONER if doubled else 1.0, without) if faults else FaultPlan()
+        if cell.robots:  # the operator model knows one arm
+            self.plan.faults = [fault for fault in self.plan.faults if fault.kind not in OPERATOR_FAULTS]
         self.outcome = Outcome(seed)
         self._limit, self._trace, self._log, self._visit = limit, trace, log, visit
         self._visit_error: Exception | None = None
@@ -157,7 +160,7 @@ class Simulation:
         outcome, host = self.outcome, self._host
         host.clock = Clock(self.plan.speed)
         injector = FaultInjector(host, self.plan, outcome.seed, self._status, self._say)
-        supervisor = SimulatedSupervisor(host, self.plan.speed, self._say, self.invariants.motion.on_clock)
+        supervisor = SimulatedSupervisor(host, self.plan.speed, self._say, self.invariants.on_clock)
         injector.lose_supervisor, injector.operators.on_leave = supervisor.restart, self._on_leave
         playing = asyncio.create_task(self._play(supervisor, injector))
         try:
@@ -210,7 +213,7 @@ class Simulation:
 
     def _on_leave(self) -> None:
         """End the run because an operator stopped the robot and left, unless another one started it again."""
-        if self.invariants.motion.stopped_by_operator:
+        if self.invariants.stopped_by_operator:
             self.outcome.left = True
             self._ended.set()
 

@@ -9,9 +9,7 @@ from dataclasses import dataclass, field
 from itertools import count, pairwise
 from typing import Any
 
-import coal
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from common.config.loading import load_robot
@@ -22,9 +20,9 @@ from common.planning.arms.coordinator import Coordinator, Retreat
 from common.planning.arms.pair_world import ArmGeometry
 from common.planning.arms.schedules import Cancel, ScheduleKeeper
 from common.planning.ik import solve_ik
-from common.planning.robot_geometry import convex_hulls
 from common.planning.trajectory import TimedPath, trajectory_message
 from common.robot.model import RobotModel
+from lab.arm_distance import ArmDistance
 
 Array = NDArray[np.float64]
 
@@ -37,43 +35,6 @@ def robots(distance: float = DISTANCE) -> dict[str, RobotModel]:
     left = load_robot("panda")
     right = left.model_copy(update={"base_position": (distance, 0.0, 0.0), "base_rpy": (0.0, 0.0, np.pi)})
     return {"left": RobotModel.load(left), "right": RobotModel.load(right)}
-
-
-class Judge:
-    """Distances between the arms by pinocchio and coal, with the convex hulls of all collision meshes."""
-
-    def __init__(self, one: RobotModel, other: RobotModel) -> None:
-        self._arms = [(robot.model, robot.model.createData(), robot.reduced(convex_hulls(robot.full_geometry()))[1])
-                      for robot in (one, other)]
-        self._placed = [pin.GeometryData(geometry) for _, _, geometry in self._arms]
-        self._request = coal.DistanceRequest()
-
-    def distance(self, q_one: Array, q_other: Array) -> float:
-        """Return the distance between the arms [m]; 0 or less: contact."""
-        for (model, data, geometry), placed, q in zip(self._arms, self._placed, (q_one, q_other), strict=True):
-            pin.updateGeometryPlacements(model, data, geometry, placed, q)
-        least = np.inf
-        for i, a in enumerate(self._arms[0][2].geometryObjects):
-            for j, b in enumerate(self._arms[1][2].geometryObjects):
-                if a.parentJoint == 0 and b.parentJoint == 0:
-                    continue
-                A, B = self._placed[0].oMg[i], self._placed[1].oMg[j]
-                if np.linalg.norm(A.act(_center(a)) - B.act(_center(b))) - _radius(a) - _radius(b) > min(least, 0.1):
-                    continue
-                least = min(least, coal.distance(
-                    a.geometry, coal.Transform3s(A.rotation, A.translation),
-                    b.geometry, coal.Transform3s(B.rotation, B.translation),
-                    self._request, coal.DistanceResult()))
-        return float(least)
-
-
-def _center(item: pin.GeometryObject) -> Array:
-    item.geometry.computeLocalAABB()
-    return np.array(item.geometry.aabb_center)
-
-
-def _radius(item: pin.GeometryObject) -> float:
-    return float(item.geometry.aabb_radius)
 
 
 @dataclass
@@ -262,7 +223,7 @@ class TwoArms:
 
 def judged(one: RobotModel, other: RobotModel, states: list[tuple[Array, Array]], step: float) -> list[float]:
     """Return the distances [m] of two arms along states (dof,) of both, about a step [rad] of a joint apart."""
-    judge, found = Judge(one, other), []
+    judge, found = ArmDistance(one, other), []
     last = np.concatenate(states[0])
     for number, pair in enumerate(states):
         both = np.concatenate(pair)
@@ -272,7 +233,7 @@ def judged(one: RobotModel, other: RobotModel, states: list[tuple[Array, Array]]
         count = max(1, int(np.ceil(move / step)))
         for k in range(1, count + 1):
             q = last + (both - last) * k / count
-            found.append(judge.distance(q[:7], q[7:]))
+            found.append(judge.least(q[:7], q[7:]))
         last = both
     return found
 

@@ -1,16 +1,19 @@
 """Invariants of a simulated cell: goals, motion after an operator's stop, objects of the ground truth."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from common import messages as m
 from common.config import load_cell
 from common.hardware.interface import Limits
+from common.robot.model import RobotModel
 from common.transport.codec import encode, encoding_of
 from common.transport.session import RawSample
-from lab.invariants import ACCEPTED, OBJECTS, Invariants
+from lab.invariants import ACCEPTED, APART, OBJECTS, Invariants
 from lab.loop import Incarnation, context_of
-from lab.motion_invariants import NEVER, UNREQUESTED
+from lab.motion_invariants import LIMITS, NEVER, UNREQUESTED
 from lab.processes import RequestLog
 
 PANDA = load_cell("panda")
@@ -104,6 +107,19 @@ def test_after_a_stop_only_the_process_that_served_it_may_brake(invariants, requ
     first.run(move, 0.0, 10, 0.5)
     then.run(move, seconds, 20, 0.501)
     assert any(UNREQUESTED in line for line in invariants.broken) != holds
+
+
+@pytest.mark.parametrize(("turned", "speed", "broken"), [(0.0, 0.0, None), (1.57, 0.0, APART), (0.0, 9.0, LIMITS)])
+def test_set_points_of_several_arms_are_checked_for_each_and_between_them(requests, turned, speed, broken):
+    cell = load_cell(str(Path(__file__).parents[1] / "data" / "two_arms.yaml"))
+    robots = {arm: RobotModel.load(robot) for arm, robot in cell.robots.items()}
+    invariants = Invariants(cell, requests, lambda: 1.0)
+    for arm, sign in (("left", -1.0), ("right", 1.0)):  # turned towards each other, or beside each other
+        robot = robots[arm]
+        q = robot.named("home") + np.array([sign * turned, 0.7, 0.0, 0.7, 0.0, 0.0, 0.0])
+        limits = Limits(tuple(robot.joint_names), robot.lower, robot.upper, robot.velocity, robot.acceleration)
+        invariants.on_set_point(limits, q, q, np.full(7, speed if arm == "right" else 0.0), 0.0, arm)
+    assert [line.partition(": ")[2].partition(":")[0] for line in invariants.broken] == ([broken] if broken else [])
 
 
 @pytest.mark.parametrize("later", [{}, {"ball_1": 0.4}, {"ball_1": 0.3, "ball_2": 0.5}])

@@ -42,7 +42,7 @@ class MovingArm(FakeCell):
         self.positions: list[np.ndarray] = []
         self.speed, self.limits = 0.0, None
 
-    def on_set_point(self, limits, _measured, q, dq, _now) -> None:
+    def on_set_point(self, limits, _measured, q, dq, _now, _arm) -> None:
         self.limits, self.speed = limits, float(np.abs(dq).max())
         self.positions.append(q.copy())
         if self.speed > FAST:

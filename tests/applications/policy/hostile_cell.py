@@ -204,9 +204,9 @@ def run_hostile(seed: int, sequences: int, solids: int = 15, interfere: bool = T
     sent: list[tuple[float, Array, Array]] = []
     check = simulation.invariants.on_set_point
 
-    def on_set_point(limits: Any, measured: Array, q: Array, dq: Array, now: float) -> None:
+    def on_set_point(limits: Any, measured: Array, q: Array, dq: Array, now: float, arm: str) -> None:
         sent.append((now, q.copy(), dq.copy()))
-        check(limits, measured, q, dq, now)
+        check(limits, measured, q, dq, now, arm)
 
     simulation.invariants.on_set_point = on_set_point  # type: ignore[method-assign]
     _current.append(attacker)
