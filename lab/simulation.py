@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Coroutine, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +111,8 @@ class Simulation:
         doubled = any(is_double(entry) for entry in services.values())
         self.plan = make_plan(seed, names, SOONER if doubled else 1.0, without) if faults else FaultPlan()
         if cell.robots:  # the operator model knows one arm
-            self.plan.faults = [fault for fault in self.plan.faults if fault.kind not in OPERATOR_FAULTS]
+            self.plan = replace(self.plan, faults=tuple(
+                fault for fault in self.plan.faults if fault.kind not in OPERATOR_FAULTS))
         self.outcome = Outcome(seed)
         self._limit, self._trace, self._log, self._visit = limit, trace, log, visit
         self._visit_error: Exception | None = None
