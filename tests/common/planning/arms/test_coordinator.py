@@ -7,7 +7,8 @@ import pytest
 
 from common.planning.arms.arm import Options
 from common.planning.arms.band import Delays, braking_time
-from common.planning.arms.coordinator import RETREAT
+from common.planning.arms.coordinator import RETREAT, Coordinator
+from common.planning.arms.schedules import ScheduleKeeper
 from tests.two_arms import RandomRequests, TwoArms, reachable
 
 BOUND = 20.0  # [s] in which every request must be over
@@ -116,6 +117,20 @@ def test_nothing_new_moves_without_the_coordinator_and_a_running_motion_ends() -
     assert sim.results["in"].state == "succeeded"
     assert sim.results["other"].state == ""
     assert np.array_equal(sim.arms["right"].q, sim.robots["right"].named("home"))
+
+
+def test_a_motion_that_a_coordinator_held_on_its_path_ends_after_a_restart_of_that() -> None:
+    sim = TwoArms()
+    sim.execute("left", "in", sim.path_to("left", middle(sim, "left"), 0.1))
+    sim.run(1.0)
+    sim.arms["left"].controller.hold(True, "right is behind its schedule", "coordinator")
+    sim.coordinator = Coordinator(sim.geometry.values(), Options(), lambda *_: True)
+    sim.keeper = ScheduleKeeper(sim.coordinator)
+    sim.run(5.0)
+    assert sim.results["in"].state == "cancelled"
+    sim.execute("left", "again", sim.path_to("left", middle(sim, "left")))
+    sim.run(5.0)
+    assert sim.results["again"].state == "succeeded"
 
 
 def test_an_arm_moves_alone_only_while_the_others_rest() -> None:
