@@ -21,7 +21,7 @@ from services import io, trajectory_executor
 from tests.services.executor_rig import NOT_TOO_LATE, ExecutorClient, move
 from tests.services.fake_cell import latest
 
-BOX = "{id: box, shape: box, size: [0.06, 0.06], height: 0.7314, x: 0.308, y: 0.109, color: [0.9, 0.1, 0.1]}"
+BOX = "{id: box, shape: box, size: [0.06, 0.06], height: 0.7314, x: 0.178, y: 0.109, color: [0.9, 0.1, 0.1]}"
 CUP = ["robot=ur5_cup", "robot.gripper.vacuum={output: vacuum, input: vacuum_ok, timeout: 2.0}", "services.io={}",
        "io.signals={vacuum: {output: 0}, vacuum_ok: {input: 0}}", "world.layout=fixed", "world.count=0",
        f"world.objects=[{BOX}]", NOT_TOO_LATE]

@@ -12,7 +12,7 @@ from common.transport.codec import decode
 from lab.simulation import Simulation
 from tests.harness import until
 
-CUP = ["robot=ur5_cup", "robot.base_position=[-0.15, 0.0, 0.4]", "services.depth_camera.rate=1.0", "services.io={}",
+CUP = ["robot=ur5_cup", "services.depth_camera.rate=1.0", "services.io={}",
        "io.signals={vacuum: {output: 0}, vacuum_ok: {input: 0}}",
        "robot.gripper.vacuum={output: vacuum, input: vacuum_ok}",
        "world.camera.width=320", "world.camera.height=240", "world.camera.fx=400", "world.camera.fy=400",

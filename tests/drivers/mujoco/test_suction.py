@@ -14,7 +14,7 @@ class CupRig(Rig):
     """A UR5 with a cup that pulls with 42 N."""
 
     def __init__(self, *objects: dict[str, object]) -> None:
-        config = load_cell("panda", ["robot=ur5_cup"])
+        config = load_cell("panda", ["robot=ur5_cup", "robot.base_position=[0.0, 0.0, 0.4]"])
         self.robot = RobotModel.load(config.robot)
         found = [{"id": f"object_{i + 1}", "x": 0.45, "y": 0.0, **obj} for i, obj in enumerate(objects)]
         self.config = World.model_validate({
