@@ -167,6 +167,16 @@ def test_failed_object_comes_last_with_other_faces_until_given_up() -> None:
     assert (of.status.state, of.status.message) == ("ERROR", "cube at (0.500, 0.000): no way")
 
 
+def test_what_is_missing_ends_the_task_with_that_reason_after_a_while_and_moves_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Gather, "choose", lambda self, seen: self.lack("no part is seen", seen))
+    of = task(give_up=5.0)
+    for now, state in ((10.0, "IDLE"), (14.9, "IDLE"), (15.1, "ERROR")):
+        of.decide(view(now=now))
+        assert (of.status.state, of.status.message, len(of.queue)) == (state, "no part is seen", 0)
+
+
 def test_task_is_done_after_the_settling_time_and_stays_so() -> None:
     of = task(settle=1.0)
     for now in (10.0, 10.5, 10.9):
