@@ -253,7 +253,7 @@ def own_modules(folder: Path) -> Iterator[None]:
         finally:
             for name, module in list(sys.modules.items()):
                 places = [getattr(module, "__file__", None) or "", *getattr(module, "__path__", ())]
-                if any(Path(place).is_relative_to(folder) for place in places if place):
+                if any(f"{place}/".startswith(f"{folder}/") for place in places):
                     del sys.modules[name]
 
 

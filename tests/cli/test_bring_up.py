@@ -62,7 +62,6 @@ def test_rejected_configuration_of_one_service_ends_the_cell_with_one_line(zence
 
 @pytest.mark.parametrize(("behaviour", "phase"), [
     pytest.param("never ready", "waiting for the moon", marks=pytest.mark.slow),
-    pytest.param("well", "hello from first", marks=pytest.mark.slow),
     pytest.param("well", "hello from last", marks=pytest.mark.slow), ("well", "0 of 2 placed - IDLE"),
 ])
 def test_interrupted_run_leaves_a_summary_and_no_process(zencell, folder, behaviour, phase):

@@ -17,14 +17,6 @@ def test_balls_below_the_minimum_area_are_reported_as_left() -> None:
 
 
 @pytest.mark.slow
-def test_rejected_balls_are_explained() -> None:
-    summary = SimulatedCell("panda", ["world.balls=[[0.4,-0.3]]", "services.workspace_validator.max_radius=0.4",
-                                      "services.smart_pick_place.grace=1.0"]).summary
-    assert (summary["state"], summary["placed"], len(summary["rejected"])) == ("DONE", 0, 1)
-    assert "1 of 1 was rejected, too far: 0.500 m" in summary["overlooked"] and summary["unexplained"] == []
-
-
-@pytest.mark.slow
 @pytest.mark.cell
 async def test_run_with_unexplained_objects_warns_and_exits_3(tmp_path) -> None:
     with RunningCell(tmp_path, "run", "panda", "--set", "world.count=1", "--set", f"{LEAST}=3000") as cell:

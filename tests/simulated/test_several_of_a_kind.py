@@ -29,13 +29,6 @@ def test_two_cameras_clear_a_table_that_neither_sees_completely(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_single_camera_leaves_objects_out_of_its_view() -> None:
-    blind = [f"services.{name}.views=[left]" for name in ("scene_manager", "workspace_validator")]
-    outcome = Simulation(load_cell(CELL, blind), 1).run()
-    assert (outcome.state, outcome.done) == ("DONE", 2), outcome  # the third lies where only the right one looks
-
-
-@pytest.mark.slow
 def test_task_is_not_done_while_one_of_two_cameras_is_silent() -> None:
     lost = "services.right_detector.topics={camera/*: nowhere/camera/*, detect*: right/detect*}"
     outcome = Simulation(load_cell(CELL, [lost, "services.smart_pick_place.look_timeout=3"]), 1).run()

@@ -19,12 +19,11 @@ print(Simulation(load_cell(sys.argv[1], sys.argv[3:]), int(sys.argv[2]), digest=
 """
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(7, marks=pytest.mark.slow)])
-def test_panda_clears_the_table(count):
-    summary = SimulatedCell("panda", [f"world.count={count}"]).summary
-    assert (summary["state"], summary["placed"], summary["targets"], summary["rejected"]) == ("DONE", count, count, [])
-    assert (summary["truth"], summary["restarts"]) == (in_box(count), {})
-    assert len(summary["plans"]) >= 2 * count and (summary["failures"], summary["retries"]) == (0, 0)
+def test_panda_clears_the_table():
+    summary = SimulatedCell("panda", ["world.count=2"]).summary
+    assert (summary["state"], summary["placed"], summary["targets"], summary["rejected"]) == ("DONE", 2, 2, [])
+    assert (summary["truth"], summary["restarts"]) == (in_box(2), {})
+    assert len(summary["plans"]) >= 4 and (summary["failures"], summary["retries"]) == (0, 0)
     assert (summary["overlooked"], summary["unexplained"]) == ("", [])
 
 

@@ -66,8 +66,8 @@ def home():
 OVER_TRAY = np.array([0.0, 0.15, 0.0, -2.0, 0.0, 2.15, 0.785])
 
 
-@pytest.mark.parametrize("at_home", [True, False])
-@pytest.mark.parametrize(("x", "y", "z"), [(0.60, 0.10, 0.25), (0.50, -0.12, 0.30), (0.45, 0.30, 0.25)])
+@pytest.mark.parametrize(("at_home", "x", "y", "z"), [
+    (True, 0.60, 0.10, 0.25), (False, 0.50, -0.12, 0.30), (False, 0.45, 0.30, 0.25)])
 def test_hand_is_found_in_the_second_image(at_home, x, y, z):
     to = detector()
     images(to, HEAP, home(), at_home=True)

@@ -117,7 +117,7 @@ def messages(arm):
     return [report.motion.message for report in arm.reports if report.motion]
 
 
-@pytest.mark.parametrize("linear", [(0.2, 0.0, 0.1), (0.2, 0.0, 0.0), (0.1, 0.1, 0.1), (0.1, -0.2, 0.0)])
+@pytest.mark.parametrize("linear", [(0.2, 0.0, 0.1), (0.1, -0.2, 0.0)])
 def test_tool_keeps_its_direction_to_the_end_of_reach_and_stops_there_with_a_reason(arm, linear):
     direction = np.array(linear) / np.linalg.norm(linear)
     before = arm.tcp
