@@ -8,7 +8,8 @@ from common.planning.arms import way_back
 from common.planning.arms.pair_world import ArmGeometry, PairWorld
 from common.planning.arms.timed_pairs import ArmMotion, PairProof, Schedule
 from common.planning.trajectory import TimedPath, sample
-from tests.two_arms import Array, Judge, reachable, robots
+from lab.arm_distance import ArmDistance
+from tests.two_arms import Array, reachable, robots
 
 CLEARANCE, BAND = 0.02, 0.2
 
@@ -48,13 +49,13 @@ def _limits(geometry: ArmGeometry):  # noqa: ANN202
 
 def nearest(one: TimedPath, other: TimedPath, delay: float, steps: int = 60) -> float:
     """Return the least distance of the arms at sampled pairs of times that the proof covers."""
-    judge = Judge(arms()[0].robot, arms()[1].robot)
+    judge = ArmDistance(arms()[0].robot, arms()[1].robot)
     end = max(one.duration, other.duration + delay)
     times = np.linspace(0.0, end, steps)
     least = np.inf
     for off in (-BAND, 0.0, BAND):
         q, p = sample(one, times), sample(other, times - delay + off)
-        least = min(least, *(judge.distance(a, b) for a, b in zip(q, p, strict=True)))
+        least = min(least, *(judge.least(a, b) for a, b in zip(q, p, strict=True)))
     return float(least)
 
 
@@ -70,13 +71,13 @@ def test_motions_that_are_proved_keep_the_clearance_at_all_times_of_the_band() -
 
 
 def test_a_certain_clash_is_closer_than_the_clearance_where_it_says() -> None:
-    judge, found = Judge(arms()[0].robot, arms()[1].robot), 0
+    judge, found = ArmDistance(arms()[0].robot, arms()[1].robot), 0
     for seed in range(12):
         one, other = crossing(seed)
         clash = proof(one, other).in_time(Schedule(0.0), Schedule(0.0), BAND)
         if clash is not None and clash.certain:
             found += 1
-            assert judge.distance(sample(one, [clash.one])[0], sample(other, [clash.other])[0]) < CLEARANCE + 1e-6
+            assert judge.least(sample(one, [clash.one])[0], sample(other, [clash.other])[0]) < CLEARANCE + 1e-6
             assert abs(clash.one - clash.other) <= BAND or clash.one >= one.duration or clash.other >= other.duration
     assert found >= 2
 
@@ -110,7 +111,7 @@ def test_what_an_arm_carries_counts() -> None:
     near: Array | None = None
     for seed in range(40):
         other = reachable(right.robot, 1, seed)[0]
-        distance = Judge(left.robot, right.robot).distance(one, other)
+        distance = ArmDistance(left.robot, right.robot).least(one, other)
         if 0.05 < distance < 0.09:
             near = other
             break
