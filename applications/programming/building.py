@@ -97,11 +97,7 @@ class Builder:
     patterns: Sequence[Pattern] = ()
 
     def build(self, step: BaseStep) -> Built:
-        """Return the stages of a step.
-
-        Raises:
-            StepProblem: it cannot be done.
-        """
+        """Return the stages of a step. Raises StepProblem."""
         if self.repeated is not None and self.repeated.held and not self.before.holding and isinstance(step, Motion):
             raise StepProblem("what the gripper held is lost")
         made = step.stages(self)

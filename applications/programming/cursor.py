@@ -47,11 +47,7 @@ class Cursor:
 
     @property
     def program(self) -> Flow:
-        """The loaded program.
-
-        Raises:
-            ConfigError: none is loaded.
-        """
+        """The loaded program. Raises ConfigError."""
         if self.flow is None:
             raise ConfigError("program", ..., "none is loaded: name one")
         return self.flow
@@ -73,11 +69,7 @@ class Cursor:
         return not self.saves or (saved is not None and (saved.position, saved.done) == (now.position, now.done))
 
     def load(self, file: ProgramFile) -> None:
-        """Go to the first step of a program.
-
-        Raises:
-            BadProgram: it, or a program that it calls, is invalid or missing.
-        """
+        """Go to the first step of a program. Raises BadProgram."""
         self.flow = Flow(load_all(file), file.name)
         self.ids = {step for each in self.flow.files.values() for step in each.steps}
         status = self.status
@@ -85,11 +77,7 @@ class Cursor:
         self.restart()
 
     def restart(self, id_: str = "") -> None:
-        """Go to a step of the main program; by default to the first one.
-
-        Raises:
-            UnknownName: lists the choices.
-        """
+        """Go to a step of the main program; by default to the first one. Raises UnknownName."""
         position = self.program.find(id_) if id_ else self.program.start
         self.status.done, self.status.total, self.status.outcome, self.status.halted = 0, 0, "", ""
         self.progress = Progress()

@@ -82,11 +82,7 @@ def rows(
 
 
 def find(data: Data, id_: str) -> Row:
-    """Return a step.
-
-    Raises:
-        UnknownName: with the choices.
-    """
+    """Return a step. Raises UnknownName."""
     listed = {row.id: row for row in rows(data["steps"])}
     if id_ not in listed:
         raise UnknownName("step", id_, listed)
@@ -104,11 +100,7 @@ def problems(data: Data) -> dict[str, str]:
 
 
 def parsed(step: Mapping[str, Any]) -> BaseStep:
-    """Return a step; nested ones are left out.
-
-    Raises:
-        ConfigError: a field is invalid.
-    """
+    """Return a step; nested ones are left out. Raises ConfigError."""
     nested = {key: [_VALID] for key in bodies(step)}
     for name, value in step.items():
         if name not in nested:
@@ -192,11 +184,7 @@ def move(data: Data, id_: str, by: int) -> None:
 
 
 def set_fields(data: Data, id_: str, values: Mapping[str, Any]) -> None:
-    """Set fields of a step as in the file; None removes a field, which then has its default.
-
-    Raises:
-        ConfigError: names the field, the value and what is expected.
-    """
+    """Set fields of a step as in the file; None removes a field, which then has its default. Raises ConfigError."""
     row = find(data, id_)
     step = {name: value for name, value in {**row.step, **values}.items() if value is not None}
     if step["id"] != id_ and any(each.id == step["id"] for each in rows(data["steps"])):
@@ -206,11 +194,7 @@ def set_fields(data: Data, id_: str, values: Mapping[str, Any]) -> None:
 
 
 def set_target(data: Data, id_: str, target: Mapping[str, Any], point: int | None = None) -> None:
-    """Set the target of a step; of several the one with a number, or add it to them.
-
-    Raises:
-        EditRefused: the step has no target.
-    """
+    """Set the target of a step; of several the one with a number, or add it to them. Raises EditRefused."""
     step = find(data, id_).step
     name = next((key for key, _ in parsed(step).targets()), "").partition("[")[0]
     if not name:

@@ -79,11 +79,7 @@ class ProgramEditor:
         await self._request("list", "")
 
     async def open(self, name: str) -> None:
-        """Open a program: its draft if there is one, else its file.
-
-        Raises:
-            ConfigError: no program has this name.
-        """
+        """Open a program: its draft if there is one, else its file. Raises ConfigError."""
         draft = self._drafts.get(name)
         if draft is None:
             content = await self._request("load", name)
@@ -91,11 +87,7 @@ class ProgramEditor:
         self._show(draft)
 
     def new(self, name: str) -> None:
-        """Start a program without steps; its file is written by `save`.
-
-        Raises:
-            ConfigError: the name is no name of a file, or is used.
-        """
+        """Start a program without steps; its file is written by `save`. Raises ConfigError."""
         if not NAME.fullmatch(name):
             raise ConfigError("program", name[:40], "must be 1 to 80 letters, digits, - and _")
         if name in self._drafts or name in self.content.programs:
@@ -103,13 +95,7 @@ class ProgramEditor:
         self._show(Draft(name, {"steps": []}))
 
     async def save(self) -> None:
-        """Write the draft to its file.
-
-        Raises:
-            EditRefused: the draft is incomplete.
-            BadProgram: the service refuses its content.
-            RemoteError: the file was changed elsewhere (`changed`), or cannot be written.
-        """
+        """Write the draft to its file. Raises EditRefused, BadProgram, RemoteError."""
         draft, text = self._draft_text()
         sent = draft.data
         try:
@@ -203,11 +189,7 @@ class ProgramEditor:
         self.edit(f"change {id_}", editing.set_target, id_, self._known().here(), None if add else self.point)
 
     def apply(self, id_: str, field: FormField, shown: Any) -> None:
-        """Set a field of a step to a displayed value.
-
-        Raises:
-            ConfigError: names the field, the value and what is expected.
-        """
+        """Set a field of a step to a displayed value. Raises ConfigError."""
         step = self._required().step(id_)
         if step is not None:
             values = field.values(step, shown)

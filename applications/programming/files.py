@@ -65,11 +65,7 @@ def path_of(folder: str | Path, program: str) -> Path:
 
 
 def revision_of(path: Path) -> str:
-    """Return what changes with each change of a file; empty without a file.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Return what changes with each change of a file; empty without a file. Raises OSError."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     except FileNotFoundError:
@@ -77,12 +73,7 @@ def revision_of(path: Path) -> str:
 
 
 def load_program(path: Path) -> ProgramFile:
-    """Return the program of a file.
-
-    Raises:
-        BadProgram: names file, line, step, field, value and choices.
-        ConfigError: the file cannot be read.
-    """
+    """Return the program of a file. Raises BadProgram and ConfigError."""
     try:
         text = path.read_bytes()[:MAX_BYTES].decode()
     except (OSError, UnicodeDecodeError) as error:
@@ -114,11 +105,7 @@ def parse_program(text: str, path: Path) -> ProgramFile:
 
 
 def save_program(file: ProgramFile) -> None:
-    """Write a program to its file, completely or not at all.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a program to its file, completely or not at all. Raises OSError."""
     write_atomically(file.path, text_of(file.program))
 
 
@@ -146,11 +133,7 @@ def new_id(kind: str, used: set[str]) -> str:
 
 
 def load_all(file: ProgramFile) -> dict[str, ProgramFile]:
-    """Return a program and all programs that it calls, by name.
-
-    Raises:
-        BadProgram, ConfigError: one cannot be read, or is missing, or programs call each other in a circle.
-    """
+    """Return a program and all programs that it calls, by name. Raises BadProgram and ConfigError."""
     found: dict[str, ProgramFile] = {}
 
     def visit(one: ProgramFile, above: tuple[str, ...]) -> None:

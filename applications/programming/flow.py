@@ -98,11 +98,7 @@ class Flow:
         return not isinstance(self.step(position), Loop | If | Call | Palletize)
 
     def enter(self, position: Position, decide: Decide) -> Position:
-        """Return the first position inside a step that leads to others, or what follows it.
-
-        Raises:
-            Undecided: its condition is not known.
-        """
+        """Return the first position inside a step that leads to others, or what follows it. Raises Undecided."""
         step, program = self.step(position), position[-1].program
         if isinstance(step, Call):
             return (*position, Frame(program=step.program))
@@ -132,11 +128,7 @@ class Flow:
         return self.after(tuple(above)) if above else ()
 
     def leaf(self, position: Position, decide: Decide) -> Position:
-        """Return the next position whose step does something, from a position on; empty: the end.
-
-        Raises:
-            Undecided: a condition on the way is not known, or there is nothing to do for many turns.
-        """
+        """Return the next position whose step does something, from a position on; empty: the end. Raises Undecided."""
         for _ in range(TRANSITIONS):
             if not position or self.is_leaf(position):
                 return position

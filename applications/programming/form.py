@@ -90,11 +90,7 @@ class FormField:
         return bool(self.path) and self.path[0] in COMMON
 
     def values(self, step: Mapping[str, Any], shown: Any) -> Data:
-        """Return the fields of the step to set for a displayed value.
-
-        Raises:
-            ConfigError: the value cannot be read.
-        """
+        """Return the fields of the step to set for a displayed value. Raises ConfigError."""
         stored = self.parse(shown)
         return {str(self.path[0]): _with(step.get(str(self.path[0])), self.path[1:], stored)} if self.path else dict(
             stored)
@@ -132,11 +128,7 @@ def fields_of(step: Data, known: Known, point: int = 0) -> list[FormField]:
 
 
 def new_step(kind: str, known: Known) -> Data:
-    """Return the data of a new step: its required fields, and the first of its alternatives.
-
-    Raises:
-        EditRefused: the cell has nothing that such a step needs.
-    """
+    """Return the data of a new step: its required fields, and the first of its alternatives. Raises EditRefused."""
     model, made = STEPS[kind], {"step": kind}
     keys = [key for key, name in model.keys().items() if model.model_fields[name].is_required()]
     for key in [*keys, *next(iter(model.ONE_OF.values()), ())[:1]]:

@@ -171,11 +171,7 @@ class BaseStep(Part):
         return self.step
 
     def stages(self, at: Builder) -> Built:
-        """Return its stages, and what is expected after them; none by default.
-
-        Raises:
-            StepProblem: it cannot be done.
-        """
+        """Return its stages, and what is expected after them; none by default. Raises StepProblem."""
         return at.built([])
 
     def problems(self, cell: Cell, folder: Path) -> Iterator[tuple[str, str]]:
@@ -229,6 +225,7 @@ class Program(Part):
     """Steps, and the poses that they name."""
 
     cell: str = Field("", description="cell in which it runs by default: a name, or a path relative to its folder")
+    arm: str = Field("", max_length=80, description="that it moves, in a cell of several arms")
     note: str = Field("", max_length=2000)
     speed: Share | None = Field(None, description="of all motions without one of their own")
     poses: dict[Word, Target] = {}

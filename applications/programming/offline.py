@@ -14,7 +14,8 @@ from common import messages as m
 from common.atomic_file import state_folder
 from common.config import Cell as CellConfig
 from common.config import Surroundings, find_file, load_cell, read_yaml, yaml_line
-from common.errors import ConfigError
+from common.config.arms import services_of_arms
+from common.errors import ConfigError, UnknownName
 from common.planning.pipeline import PlanningPipeline
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
@@ -38,11 +39,7 @@ def is_program(path: str) -> bool:
 
 
 def cell_of(file: ProgramFile, given: str | None) -> str:
-    """Return the cell in which a program runs: the given one, else that of the program.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Return the cell in which a program runs: the given one, else that of the program. Raises ConfigError."""
     if given:
         return given
     if not file.program.cell:
@@ -52,17 +49,15 @@ def cell_of(file: ProgramFile, given: str | None) -> str:
     return file.program.cell
 
 
-def load_single(cell: str, overrides: tuple[str, ...] = ()) -> CellConfig:
-    """Return a cell with one robot.
-
-    Raises:
-        ConfigError, UnknownName: the cell is not valid, or has several robots.
-    """
+def load_for(cell: str, arm: str, overrides: tuple[str, ...] = ()) -> CellConfig:
+    """Return a cell as the arm of a program has it. Raises ConfigError and UnknownName."""
     loaded = load_cell(cell, overrides)
-    if loaded.robots:
-        raise ConfigError("cell", cell, f"has several robots ({', '.join(loaded.robots)}), and a program moves "
-                          "one: use a cell of one robot")
-    return loaded
+    if not arm and loaded.robots:
+        raise ConfigError("cell", cell, f"has several robots ({', '.join(loaded.robots)}), and a program moves one: "
+                          f"add `arm: {next(iter(loaded.robots))}` at its top")
+    if arm and arm not in loaded.robots:
+        raise UnknownName(f"arm of the cell {loaded.name}", arm, loaded.robots)
+    return loaded.of_arm(arm) if arm else loaded
 
 
 def overrides_for(file: ProgramFile, cell: str, others: tuple[str, ...] = ()) -> tuple[list[str], Path]:
@@ -73,15 +68,17 @@ def overrides_for(file: ProgramFile, cell: str, others: tuple[str, ...] = ()) ->
         ConfigError, UnknownName: the cell is not valid.
     """
     load_all(file)
-    loaded = load_single(cell, others)
+    arm, loaded = file.program.arm, load_for(cell, file.program.arm, others)
     progress = state_folder() / "programs" / f"{loaded.name}.{file.name}.json"
     runner: dict[str, Any] = {"program": str(file.path.resolve()), "progress": str(progress)}
-    services: dict[str, Any] = read_yaml(find_file("cells", cell))["services"]
-    by_name = {str(key).rpartition(".")[2]: key for key in services}
     own = next((name for name, entry in loaded.services.items() if entry.kind == RUNNER), "")
     if own:
         return [f"services.{own}.{name}={value}" for name, value in runner.items()] + ["autostart=false"], progress
-    services = {key: value or {} for key, value in services.items() if key != by_name.get(loaded.task)}
+    tree = read_yaml(find_file("cells", cell))
+    services = services_of_arms(tree["services"], list(tree.get("robots", ())))
+    tasks = {loaded.task, *load_cell(cell, others).arms.tasks.values()}
+    services = {key: value or {} for key, value in services.items() if str(key).rpartition(".")[2] not in tasks}
+    runner |= {"arm": arm} if arm else {}
     return [f"services={yaml_line({**services, RUNNER: runner})}", "application=programming", f"task={RUNNER}",
             "autostart=false"], progress
 
@@ -101,7 +98,7 @@ def rehearse(path: Path, cell: str | None, overrides: tuple[str, ...] = (), *, e
     """
     file = load_program(path)
     flow = Flow(load_all(file), file.name)
-    loaded = load_single(cell_of(file, cell), overrides)
+    loaded = load_for(cell_of(file, cell), file.program.arm, overrides)
     robot = RobotModel.load(loaded.robot)
     around = loaded.section(Surroundings)
     assert isinstance(around, Surroundings)
@@ -149,11 +146,7 @@ def problems(rehearser: Rehearser) -> list[str]:
 
 
 def require_no_problems(rehearser: Rehearser) -> None:
-    """Raise all problems of a dry run.
-
-    Raises:
-        BadProgram: there are some.
-    """
+    """Raise all problems of a dry run. Raises BadProgram."""
     if found := problems(rehearser):
         raise BadProgram(found)
 
@@ -166,7 +159,7 @@ def exported(path: Path, cell: str | None) -> str:
     """
     file = load_program(path)
     files, name = load_all(file), cell_of(file, cell)
-    loaded = load_single(name)
+    loaded = load_for(name, file.program.arm)
     stages = cell_with(loaded, RobotModel.load(loaded.robot))
     found = [f"{each.path}:{each.lines.get(step.id, 0)}: {step.id}: {problem}" for each in files.values()
              for step, problem in static_problems(each, stages, loaded.io)]

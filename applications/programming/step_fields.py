@@ -57,11 +57,7 @@ class StepFields:
         return bool(self._pending)
 
     def flush(self) -> None:
-        """Apply what was entered so far without waiting for the end of typing.
-
-        Raises:
-            ConfigError: a value is invalid; the reason is shown below it.
-        """
+        """Apply what was entered so far without waiting for the end of typing. Raises ConfigError."""
         for path in list(self._pending):
             self._change(path)
 

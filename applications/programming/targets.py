@@ -40,11 +40,7 @@ class Cell:
     def resolve(
         self, target: Target, poses: Mapping[str, Target], start: Array | None
     ) -> tuple[m.JointGoal | m.PoseGoal, Array]:
-        """Return the goal of a target and the pose (4, 4) of the tool there.
-
-        Raises:
-            StepProblem: the pose is unknown, or has another number of joints.
-        """
+        """Return the goal of a target and the pose (4, 4) of the tool there. Raises StepProblem."""
         found = poses.get(target.name, target)
         if found.name:
             return self._named(found.name, poses)
@@ -75,11 +71,7 @@ class Cell:
         return m.JointGoal(positions=q), self.robot.fk(q)
 
     def require_gripper(self) -> GripperConfig:
-        """Return the gripper.
-
-        Raises:
-            StepProblem: the robot has none.
-        """
+        """Return the gripper. Raises StepProblem."""
         if self.gripper is None:
             raise StepProblem("the robot of this cell has no gripper")
         return self.gripper

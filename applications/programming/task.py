@@ -74,12 +74,7 @@ class ProgramTask(Task[View]):
         return self.running is not None or (status.state == "RUNNING" and status.started and not status.halted)
 
     def go_to(self, step: str = "") -> None:
-        """Make a step of the program the next one; by default the first one.
-
-        Raises:
-            UnknownName: lists the choices.
-            ConfigError: no program is loaded.
-        """
+        """Make a step of the program the next one; by default the first one. Raises UnknownName and ConfigError."""
         self.at.restart(step)
         self._drop_all()
         if self.status.state in ENDED:
@@ -277,11 +272,7 @@ class ProgramTask(Task[View]):
         self.call = None
 
     def _holds(self, condition: Condition, view: View) -> bool:
-        """Return whether a condition holds.
-
-        Raises:
-            Undecided: its signal is not known now.
-        """
+        """Return whether a condition holds. Raises Undecided."""
         if condition.signal:
             value = view.signal(condition.signal)
             if value is None:
