@@ -225,7 +225,6 @@ class Program(Part):
     """Steps, and the poses that they name."""
 
     cell: str = Field("", description="cell in which it runs by default: a name, or a path relative to its folder")
-    arm: str = Field("", max_length=80, description="that it moves, in a cell of several arms")
     note: str = Field("", max_length=2000)
     speed: Share | None = Field(None, description="of all motions without one of their own")
     poses: dict[Word, Target] = {}

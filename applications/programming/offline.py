@@ -14,8 +14,7 @@ from common import messages as m
 from common.atomic_file import state_folder
 from common.config import Cell as CellConfig
 from common.config import Surroundings, find_file, load_cell, read_yaml, yaml_line
-from common.config.arms import services_of_arms
-from common.errors import ConfigError, UnknownName
+from common.errors import ConfigError
 from common.planning.pipeline import PlanningPipeline
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose
@@ -49,15 +48,13 @@ def cell_of(file: ProgramFile, given: str | None) -> str:
     return file.program.cell
 
 
-def load_for(cell: str, arm: str, overrides: tuple[str, ...] = ()) -> CellConfig:
-    """Return a cell as the arm of a program has it. Raises ConfigError and UnknownName."""
+def load_single(cell: str, overrides: tuple[str, ...] = ()) -> CellConfig:
+    """Return a cell with one robot. Raises ConfigError and UnknownName."""
     loaded = load_cell(cell, overrides)
-    if not arm and loaded.robots:
-        raise ConfigError("cell", cell, f"has several robots ({', '.join(loaded.robots)}), and a program moves one: "
-                          f"add `arm: {next(iter(loaded.robots))}` at its top")
-    if arm and arm not in loaded.robots:
-        raise UnknownName(f"arm of the cell {loaded.name}", arm, loaded.robots)
-    return loaded.of_arm(arm) if arm else loaded
+    if loaded.robots:
+        raise ConfigError("cell", cell, f"has several robots ({', '.join(loaded.robots)}), and a program moves "
+                          "one: use a cell of one robot")
+    return loaded
 
 
 def overrides_for(file: ProgramFile, cell: str, others: tuple[str, ...] = ()) -> tuple[list[str], Path]:
@@ -68,17 +65,15 @@ def overrides_for(file: ProgramFile, cell: str, others: tuple[str, ...] = ()) ->
         ConfigError, UnknownName: the cell is not valid.
     """
     load_all(file)
-    arm, loaded = file.program.arm, load_for(cell, file.program.arm, others)
+    loaded = load_single(cell, others)
     progress = state_folder() / "programs" / f"{loaded.name}.{file.name}.json"
     runner: dict[str, Any] = {"program": str(file.path.resolve()), "progress": str(progress)}
+    services: dict[str, Any] = read_yaml(find_file("cells", cell))["services"]
+    by_name = {str(key).rpartition(".")[2]: key for key in services}
     own = next((name for name, entry in loaded.services.items() if entry.kind == RUNNER), "")
     if own:
         return [f"services.{own}.{name}={value}" for name, value in runner.items()] + ["autostart=false"], progress
-    tree = read_yaml(find_file("cells", cell))
-    services = services_of_arms(tree["services"], list(tree.get("robots", ())))
-    tasks = {loaded.task, *load_cell(cell, others).arms.tasks.values()}
-    services = {key: value or {} for key, value in services.items() if str(key).rpartition(".")[2] not in tasks}
-    runner |= {"arm": arm} if arm else {}
+    services = {key: value or {} for key, value in services.items() if key != by_name.get(loaded.task)}
     return [f"services={yaml_line({**services, RUNNER: runner})}", "application=programming", f"task={RUNNER}",
             "autostart=false"], progress
 
@@ -98,7 +93,7 @@ def rehearse(path: Path, cell: str | None, overrides: tuple[str, ...] = (), *, e
     """
     file = load_program(path)
     flow = Flow(load_all(file), file.name)
-    loaded = load_for(cell_of(file, cell), file.program.arm, overrides)
+    loaded = load_single(cell_of(file, cell), overrides)
     robot = RobotModel.load(loaded.robot)
     around = loaded.section(Surroundings)
     assert isinstance(around, Surroundings)
@@ -159,7 +154,7 @@ def exported(path: Path, cell: str | None) -> str:
     """
     file = load_program(path)
     files, name = load_all(file), cell_of(file, cell)
-    loaded = load_for(name, file.program.arm)
+    loaded = load_single(name)
     stages = cell_with(loaded, RobotModel.load(loaded.robot))
     found = [f"{each.path}:{each.lines.get(step.id, 0)}: {step.id}: {problem}" for each in files.values()
              for step, problem in static_problems(each, stages, loaded.io)]

@@ -14,7 +14,7 @@ from applications.programming.cursor import FAILED, SUCCEEDED
 from applications.programming.functions import call_function
 from applications.programming.handling import Palletize
 from applications.programming.model import STEPS, BaseStep, Condition, Target
-from applications.programming.offline import cell_with, load_for
+from applications.programming.offline import cell_with, load_single
 from applications.programming.steps import Python, Wait
 from applications.programming.targets import Cell, NotSeen, StepProblem
 from common import messages as m
@@ -31,8 +31,8 @@ from common.time_source import monotonic
 
 
 @lru_cache
-def _config(cell: str, arm: str) -> Cell:
-    loaded = load_for(cell, arm)
+def _config(cell: str) -> Cell:
+    loaded = load_single(cell)
     return cell_with(loaded, RobotModel.load(loaded.robot))
 
 

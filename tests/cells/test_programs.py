@@ -113,9 +113,11 @@ async def test_program_of_a_killed_supervisor_is_resumed_only_on_request_and_for
             assert "slow was interrupted at step down" in halted.halted
             command.until("slow was interrupted at step down")
             motion = bus.reader(topics.MOTION_STATUS)
-            await asyncio.sleep(3.0)
+            await bus.client(PROGRAM_COMMAND).call(ProgramCommand(command="breakpoint", step="away"), PATIENCE)
+            await until(statuses, lambda status: status.breakpoints == ["away"])  # it runs, and still halts
             assert (motion.latest or await motion.next()).state == "none"
-            assert (await asyncio.to_thread(place.say, "program", "resume")) == ["slow: step down (line 4)"]
+            assert (await asyncio.to_thread(place.say, "program", "resume")) == [
+                "slow: step down (line 4); breakpoints: away"]
             await until(motion, lambda m: m.state == "active" and m.progress > 0.1)
             command.interrupt()
         assert command.end() == 130

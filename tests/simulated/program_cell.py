@@ -11,7 +11,7 @@ from common.config import load_cell
 from common.messages import MotionStatus
 from common.transport.bus import Bus
 from common.transport.reader import Reader
-from lab.simulation import Outcome, Simulation
+from lab.simulation import Simulation
 
 CELL = str(Path(__file__).parents[1] / "data" / "programs.yaml")
 
@@ -37,9 +37,9 @@ class Operator:
 
 def simulate(
     folder: Path, visit: Callable[[Operator], Awaitable[None]], *overrides: str, cell: str = CELL, limit: float = 120.0,
-    made: list[Simulation] | None = None,
-) -> Outcome:
-    """Run a cell whose programs are in a folder; `made` gets the simulation."""
+    made: list[Simulation] | None = None, state: str = "DONE",
+) -> None:
+    """Run a cell whose programs are in a folder, up to a state without a crash; `made` gets the simulation."""
 
     async def visited(bus: Bus) -> None:
         await visit(Operator(bus))
@@ -48,7 +48,8 @@ def simulate(
     simulation = Simulation(loaded, 1, visit=visited, limit=limit)
     if made is not None:
         made.append(simulation)
-    return simulation.run()
+    outcome = simulation.run()
+    assert (outcome.state, outcome.crashes, outcome.broken) == (state, [], []), outcome
 
 
 async def until(motion: Reader[MotionStatus], condition: Callable[[MotionStatus], bool]) -> MotionStatus:

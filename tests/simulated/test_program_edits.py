@@ -48,7 +48,7 @@ def test_file_that_was_changed_since_it_was_read_is_neither_overwritten_nor_dele
         await edit(operator, "delete", "one", revision=newest.revision)
         assert (await edit(operator, "list")).programs == []
 
-    assert not simulate(tmp_path, visit, limit=10.0).crashes
+    simulate(tmp_path, visit, limit=10.0, state="IDLE")
 
 
 def test_invalid_program_and_hostile_names_are_refused_with_a_line(tmp_path: Path) -> None:
@@ -56,13 +56,17 @@ def test_invalid_program_and_hostile_names_are_refused_with_a_line(tmp_path: Pat
     folder.mkdir()
 
     async def visit(operator: Operator) -> None:
-        invalid = await edit(operator, "save", "one", text="steps: [{step: fly}]")
-        assert invalid.revision == "" and "'fly' is not a step" in invalid.problems[0]
+        for text, problem in (("steps: [{step: fly}]", "'fly' is not a step"), ("steps: [{step: move}]", "is missing")):
+            invalid = await edit(operator, "save", "one", text=text)
+            assert (invalid.revision, invalid.programs) == ("", []) and problem in invalid.problems[0]
+        unknown = "steps:\n  - {step: move, id: move1, to: nowhere}\n"
+        found = await edit(operator, "check", "one", text=unknown)
+        assert found.text == unknown and "unknown pose 'nowhere'" in found.problems[0]
         for name in ("../out", "/tmp/out", "a/b", ".", "..", "x.yaml", "a b", "a" * 81):
             code, line = await refusal(operator, "save", name, text=ONE)
             assert code == "bad_program" and "is no name of a program" in line and "\n" not in line
 
-    assert not simulate(folder, visit, limit=10.0).crashes
+    simulate(folder, visit, limit=10.0, state="IDLE")
     assert [each.name for each in tmp_path.iterdir()] == ["programs"] and not list(folder.iterdir())
 
 
@@ -81,7 +85,7 @@ def test_breakpoint_of_another_program_is_refused_while_one_runs(tmp_path: Path)
         status = await operator.send("breakpoint", program="one", step="back")
         assert status.breakpoints == ["back"], "a step that the file has since then"
 
-    assert not simulate(tmp_path, visit).crashes
+    simulate(tmp_path, visit)
 
 
 def test_dry_run_ends_when_the_program_runs(tmp_path: Path) -> None:
@@ -95,4 +99,4 @@ def test_dry_run_ends_when_the_program_runs(tmp_path: Path) -> None:
         assert ended.rehearsal.message == "ended, as the program runs"
         await operator.until(lambda status: status.state == "DONE")
 
-    assert not simulate(tmp_path, visit).crashes
+    simulate(tmp_path, visit)

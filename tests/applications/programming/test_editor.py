@@ -6,7 +6,7 @@ import pytest
 
 from applications.programming import editing
 from applications.programming.editor import ProgramEditor, problems_by_step
-from applications.programming.form import Known, fields_of
+from applications.programming.form import Known
 from common.errors import ConfigError, RemoteError, ZencellError
 from tests.applications.programming.program_service import Cell
 
@@ -18,28 +18,24 @@ def editor_of(cell: Cell) -> ProgramEditor:
     return ProgramEditor(cell.console, lambda: KNOWN)
 
 
-def ids(editor: ProgramEditor) -> list[str]:
-    assert editor.draft is not None
-    return [row.id for row in editor.draft.rows]
-
-
-async def test_new_program_is_edited_saved_and_opened_again() -> None:
+def new_program() -> tuple[Cell, ProgramEditor]:
     cell = Cell()
     one = editor_of(cell)
     one.new("load")
-    with pytest.raises(ZencellError, match="at least one step"):
-        await one.save()
-    one.add_here("")
-    one.add("grip", one.chosen)
-    one.add("wait", "move1")
-    assert ids(one) == ["move1", "wait1", "grip1"] and one.chosen == "wait1"
-    await one.save()
-    assert not one.draft.unsaved and "joints: [0.1, 0.2]" in cell.files["load"]
-    other = editor_of(cell)
-    await other.refresh()
-    assert other.content.programs == ["load"]
-    await other.open("load")
-    assert ids(other) == ids(one) and other.draft.data == one.draft.data
+    return cell, one
+
+
+async def opened(text: str = WAIT) -> tuple[Cell, ProgramEditor]:
+    cell = Cell()
+    cell.files["load"] = text
+    one = editor_of(cell)
+    await one.open("load")
+    return cell, one
+
+
+def ids(editor: ProgramEditor) -> list[str]:
+    assert editor.draft is not None
+    return [row.id for row in editor.draft.rows]
 
 
 async def test_second_editor_never_overwrites_the_edits_of_the_first() -> None:
@@ -84,10 +80,7 @@ async def test_name_that_could_lead_out_of_the_folder_is_refused(name: str) -> N
 
 
 async def test_program_is_deleted_at_the_second_request_only() -> None:
-    cell = Cell()
-    cell.files["load"] = WAIT
-    one = editor_of(cell)
-    await one.open("load")
+    cell, one = await opened()
     await one.delete()
     assert one.confirms_deletion and "load" in cell.files and "Press again" in cell.notes[-1]
     one.add("retreat", "wait1")
@@ -99,10 +92,7 @@ async def test_program_is_deleted_at_the_second_request_only() -> None:
 
 
 async def test_program_that_was_changed_elsewhere_is_not_deleted() -> None:
-    cell = Cell()
-    cell.files["load"] = WAIT
-    one = editor_of(cell)
-    await one.open("load")
+    cell, one = await opened()
     cell.files["load"] += "note: of another operator\n"
     await one.delete()
     with pytest.raises(RemoteError, match="changed elsewhere"):
@@ -111,9 +101,7 @@ async def test_program_that_was_changed_elsewhere_is_not_deleted() -> None:
 
 
 async def test_run_saves_first_and_names_operator_and_acknowledged_stops() -> None:
-    cell = Cell()
-    one = editor_of(cell)
-    one.new("load")
+    cell, one = new_program()
     one.add("wait", "")
     await one.command("run_from", "wait1")
     (sent,) = cell.commands
@@ -123,9 +111,7 @@ async def test_run_saves_first_and_names_operator_and_acknowledged_stops() -> No
 
 
 async def test_program_that_cannot_be_saved_is_not_run() -> None:
-    cell = Cell()
-    one = editor_of(cell)
-    one.new("load")
+    cell, one = new_program()
     one.add("loop", "")
     with pytest.raises(ZencellError, match="loop1: steps: needs at least one step"):
         await one.command("run")
@@ -139,10 +125,7 @@ async def test_program_that_cannot_be_saved_is_not_run() -> None:
 
 
 async def test_same_command_again_overrides_another_operator_until_something_changes() -> None:
-    cell = Cell()
-    cell.files["load"] = WAIT
-    one = editor_of(cell)
-    await one.open("load")
+    cell, one = await opened()
     cell.refusal = RemoteError("program_runner", "held", "anna holds the arm")
     await one.command("run")
     assert cell.commands == [] and "anna holds the arm: press again to override" in cell.notes[-1]
@@ -153,25 +136,8 @@ async def test_same_command_again_overrides_another_operator_until_something_cha
     assert cell.commands[-1].override
 
 
-async def test_field_is_applied_in_the_units_of_the_file_and_refused_with_a_reason() -> None:
-    cell = Cell()
-    one = editor_of(cell)
-    one.new("load")
-    one.add("retreat", "")
-    fields = {each.label: each for each in fields_of(one.step, KNOWN)}
-    one.apply("retreat1", fields["Distance [mm]"], "250")
-    one.apply("retreat1", fields["Speed [%]"], "50")
-    assert one.step["distance"] == 0.25 and one.step["speed"] == 0.5
-    with pytest.raises(ConfigError, match=r"speed: 2\.0 must be less than or equal to 1"):
-        one.apply("retreat1", fields["Speed [%]"], "200")
-    one.apply("retreat1", fields["Id"], "back")
-    assert one.chosen == "back" and one.step["distance"] == 0.25
-
-
 async def test_check_assigns_problems_to_steps() -> None:
-    cell = Cell()
-    one = editor_of(cell)
-    one.new("load")
+    cell, one = new_program()
     one.add("loop", "")
     await one.check()
     assert cell.checked == [], "an incomplete draft is not sent"

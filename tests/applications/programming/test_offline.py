@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
-from applications.programming.files import load_program
+from applications.programming.building import Builder, Built
+from applications.programming.editing import parsed
+from applications.programming.export import script
+from applications.programming.files import BadProgram, load_program
 from applications.programming.flow import Flow, Undecided
+from applications.programming.form import Known, fields_of, new_step
+from applications.programming.model import STEPS, Distance, Motion
 from applications.programming.offline import rehearse
+from applications.programming.targets import backed, pose_goal
 from tests.harness import ask
 
 CELL = str(Path(__file__).parents[2] / "data" / "programs.yaml")
@@ -155,3 +162,33 @@ steps:
 
     with pytest.raises(Undecided):
         flow.leaf(flow.after(flow.find("p")[:1]), unknown)
+
+
+def test_one_class_is_a_kind_of_step_in_files_on_the_page_and_in_a_dry_run(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    class Wipe(Motion):
+        """Move the tool there and back: a step of a user."""
+
+        step: Literal["wipe"] = "wipe"
+        length: Distance = 0.1
+
+        def __str__(self) -> str:
+            return f"wipe {1e3 * self.length:g} mm"
+
+        def stages(self, at: Builder) -> Built:
+            start = at.before.T_world_tcp
+            there = backed(start, self.length, "world")
+            return at.built([at.motion(self, self.id, pose_goal(T), straight=True) for T in (there, start)], start)
+
+    request.addfinalizer(lambda: STEPS.pop("wipe"))
+    step = new_step("wipe", Known())
+    assert str(parsed(step)) == "wipe 100 mm"
+    shown = {each.label: each.shown for each in fields_of({**step, "id": "wipe1"}, Known())}
+    assert (shown["Length [mm]"], shown["Speed [%]"]) == ("100", "")
+    text = "steps: [{step: move, to: {position: [0.5, 0.1, 0.3]}}, {step: wipe, length: 0.05}]"
+    found = rehearse(Path(written(tmp_path, text)), CELL)
+    assert [(each.step, each.problem) for each in found.result.steps] == [("move1", ""), ("wipe1", "")]
+    assert found.planned == 3 and "do.wipe(length=0.05)" in script(found.flow.files, "program", CELL)
+    with pytest.raises(BadProgram, match=r"steps\[0\].length: 3 must be less than or equal to 2"):
+        load_program(Path(written(tmp_path, "steps: [{step: wipe, length: 3}]")))
