@@ -48,7 +48,7 @@ def test_file_that_was_changed_since_it_was_read_is_neither_overwritten_nor_dele
         await edit(operator, "delete", "one", revision=newest.revision)
         assert (await edit(operator, "list")).programs == []
 
-    simulate(tmp_path, visit, limit=10.0, state="IDLE")
+    simulate(tmp_path, visit, limit=10.0, state="NOT ENDED")
 
 
 def test_invalid_program_and_hostile_names_are_refused_with_a_line(tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_invalid_program_and_hostile_names_are_refused_with_a_line(tmp_path: Pat
             code, line = await refusal(operator, "save", name, text=ONE)
             assert code == "bad_program" and "is no name of a program" in line and "\n" not in line
 
-    simulate(folder, visit, limit=10.0, state="IDLE")
+    simulate(folder, visit, limit=10.0, state="NOT ENDED")
     assert [each.name for each in tmp_path.iterdir()] == ["programs"] and not list(folder.iterdir())
 
 
@@ -76,7 +76,7 @@ def test_breakpoint_of_another_program_is_refused_while_one_runs(tmp_path: Path)
 
     async def visit(operator: Operator) -> None:
         await operator.send("run", program="one")
-        await operator.until(lambda status: status.step == "there")
+        await operator.until(lambda status: status.state == "RUNNING")
         with pytest.raises(RemoteError, match="one is at step there"):
             await operator.send("breakpoint", program="two", step="back")
         assert (await operator.until(lambda status: status.state == "DONE")).program == "one"
