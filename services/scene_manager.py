@@ -12,10 +12,11 @@ from applications.pick_place.detections import CameraDetections, DetectionViews,
 from applications.pick_place.perceived_scene import PerceivedScene
 from applications.pick_place.tracks import SceneParameters
 from common import topics
-from common.config import RobotConfig, Surroundings
+from common.config import Arms, RobotConfig, Surroundings
 from common.errors import ConfigError
 from common.perception.camera_input import FrameError, SkippedFrames
 from common.perception.moving import Encoders
+from common.process.other_arms import OtherArm
 from common.process.planning_scene import SceneWriter
 from common.process.service import main
 from common.robot.model import RobotModel
@@ -28,6 +29,7 @@ class Config(ViewsParameters, SceneParameters):
     only_at_home: bool = Field(False, description="use only images taken with the arm at home: for a camera whose "
                                                   "view the arm occludes otherwise")
     robot: RobotConfig
+    arms: Arms = Arms()
     world: Surroundings
 
 
@@ -36,6 +38,8 @@ async def run(bus: Bus, config: Config) -> None:
     views = DetectionViews(bus, config.views, config.world, config.robot, bus.log, only_at_home=config.only_at_home)
     joints = bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
+    others = [OtherArm(bus, name, other) for name, other in config.arms.robots.items()
+              if config.arms.own not in ("", name)]
     out = SceneWriter(bus)
     robot = RobotModel.load(config.robot)
     if config.robot.gripper is None:
@@ -52,6 +56,8 @@ async def run(bus: Bus, config: Config) -> None:
         state, measured = gripper.latest, joints.latest
         q = robot.order(measured.name, measured.position) if measured else None
         T_world_tcp = robot.fk(q) if q is not None else None
+        known = [arm.now() for arm in others]
+        scene.held_by_others = [one.holds for one in known if one is not None and one.holds is not None]
         if state is not None:
             scene.update_gripper(state, T_world_tcp)
         return T_world_tcp

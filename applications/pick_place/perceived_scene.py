@@ -17,6 +17,7 @@ from common.perception.occlusion import Occlusion
 from common.perception.pinhole import Pinhole
 from common.robot.transforms import invert, matrix_to_pose, pose_to_matrix
 from common.scene.fixtures import color_of, fixed_objects, occupied_slots, slot_positions
+from common.tasks.stages import place_of
 
 Array = NDArray[np.float64]
 
@@ -71,6 +72,7 @@ class PerceivedScene:
         self._undetected_width: float | None = None  # of a held object that no detector reported [m]
         self._has_balls = False  # whether a detector reported any
         self._held: m.AttachedObject | None = None
+        self.held_by_others: list[m.CollisionObject] = []  # by other arms of the cell, in world
         self._changed_hands_at = 0
         self._stamp = 0
 
@@ -108,7 +110,7 @@ class PerceivedScene:
             elif shown:
                 if shown[0].container.id not in self.around.filled_by_others:
                     unsorted.append(thing)
-            elif hand is None or math.dist(hand, thing.position) > max(thing.size) / 2:
+            elif not self._is_in_a_hand(thing, hand):
                 on_table.append(thing)
         radius = self.around.ball_radius
         self._tracks.update(on_table, stamp * 1e-9, view, at_times, None if hidden is None else (
@@ -126,6 +128,11 @@ class PerceivedScene:
         self._free -= {slot for slot, since in self._since.items() if (stamp - since) * 1e-9 >= AT_REST}
         if at_times:
             self._occasional_views.add(view)
+
+    def _is_in_a_hand(self, thing: Sighting, hand: tuple[float, ...] | None) -> bool:
+        held = [place_of(other.pose) for other in self.held_by_others]
+        return (hand is not None and math.dist(hand, thing.position) <= max(thing.size) / 2) or any(
+            math.dist(place, thing.position) <= max(thing.size) for place in held)
 
     def _retain_occluded(self, view: int, now: Occupied, hidden: Occlusion) -> None:
         """Keep the state of occupied slots that are occluded now."""
@@ -171,7 +178,16 @@ class PerceivedScene:
         thing = self._object(track.id, "attached", track.sighting, pose) if track else self._undetected(
             self._tracks.new_id(), gripper.width)
         self._undetected_width = None if track else gripper.width
+        if track is None and (other := self._handed_over(T_world_tcp)) is not None:
+            thing, self._undetected_width = other.model_copy(update={"id": thing.id}), None
         self._held = m.AttachedObject(link=self.tcp_link, object=thing)
+
+    def _handed_over(self, T_world_tcp: Array) -> m.CollisionObject | None:
+        """Return what another arm holds between the fingers of this one, in the tool frame."""
+        near = [each for each in self.held_by_others if math.dist(
+            place_of(each.pose), T_world_tcp[:3, 3]) <= max(each.dimensions)]
+        return near[0].model_copy(update={"pose": matrix_to_pose(
+            invert(T_world_tcp) @ pose_to_matrix(near[0].pose))}) if near else None
 
     def _undetected(self, name: str, width: float) -> m.CollisionObject:
         """Return a held object that no camera reported: the fingers measure its width [m], nothing its other sizes."""

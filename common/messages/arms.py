@@ -31,7 +31,8 @@ class ReserveRequest(Message):
     attached: list[AttachedObject] = Field(
         [], max_length=50, description="carried besides what the planning scene of the arm says")
     may_touch: list[Label] = Field(
-        [], max_length=50, description="carried objects that the grippers of two arms may touch: a handover")
+        [], max_length=50, description="that of the motion request: object that another arm carries, and that the "
+                                    "gripper may touch for a handover")
     joins: Label = Field("", description="id of the goal that this one continues at speed, from `join_time` of it [s]")
     join_time: float = Field(0.0, ge=-1e9, le=1e9)
 
@@ -43,7 +44,8 @@ class ReserveReply(Message):
 
     header: Header = Header()
     state: ReservationState
-    error: Label = Field("", description="code of a refusal: blocked, unknown_arm, blocked_too_long, not_proved")
+    error: Label = Field("", description="code of a refusal: blocked, unknown_arm, blocked_too_long, not_proved, "
+                                          "may_touch")
     message: Text = Field("", description="what the motion waits for, or why it is refused")
     waits_for: list[Label] = Field([], max_length=16, description="arms that it waits for")
     waited: Seconds = Field(0.0, description="time since the first request of this id [s, cell time]")

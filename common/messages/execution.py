@@ -51,7 +51,7 @@ class ExecuteRequest(Message):
 
     max_bytes: ClassVar[int] = TRAJECTORY_BYTES + SMALL_BYTES
     max_parts: ClassVar[int] = 128 * 1024
-    omitted_defaults: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp", "joins", "join_time", "start_at")
+    omitted_defaults: ClassVar[tuple[str, ...]] = ("plan", "scene_stamp", "joins", "join_time", "start_at", "may_touch")
 
     header: Header = Header()
     id: Name
@@ -67,6 +67,8 @@ class ExecuteRequest(Message):
     join_time: Finite = Field(0.0, description="time on the trajectory of that goal at which this one starts, at its "
                                                "position and velocity [s]")
     start_at: Since = Field(0, description="cell time at which the arm starts, at rest until then [ns]; 0: at once")
+    may_touch: list[Label] = Field([], max_length=8, description="object that another arm carries and that the gripper "
+                                   "may touch, slowly and from near, for a handover; the coordinator decides")
 
 
 class FollowedRequest(Message):

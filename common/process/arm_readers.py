@@ -162,7 +162,7 @@ class ArmLink:
         while monotonic() < end:
             status = await self._execute.call(ExecuteRequest(
                 header=Header(stamp=self._clock.now_ns()), id=f"{retreat.goal}-{self._clock.now_ns()}",
-                trajectory=trajectory_message(self._robot, retreat.path)), TIMEOUT)
+                trajectory=trajectory_message(self._robot, retreat.path), may_touch=list(retreat.may_touch)), TIMEOUT)
             if status.state != "rejected":
                 return
             problem = status.message

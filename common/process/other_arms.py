@@ -5,22 +5,27 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from common import topics
+from common.arms import arms_topic
 from common.config import Arms, RobotConfig
 from common.messages import CollisionObject, Color, JointState, PlanningScene
 from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_pose, pose_to_matrix, transform
+from common.tasks.handover import Partner
+from common.topics import Topic
 from common.transport.bus import Bus
 
 Array = NDArray[np.float64]
 
 GREY = Color(r=0.6, g=0.6, b=0.65, a=0.8)
 THINNEST = 0.001  # [m] of a box
+SILENT = 0.5  # [s] wall: without joint states for longer, what an arm holds is unknown
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,33 @@ class ArmBoxes:
         return CollisionObject.model_validate({
             "id": f"{self._name}/{name}", "role": "fixture", "pose": matrix_to_pose(T_world_object), "color": GREY,
             **shape})
+
+
+class OtherArm:
+    """Reads what another arm of the cell does and holds, in world."""
+
+    def __init__(self, bus: Bus, name: str, robot: RobotConfig, status: Topic[Any] | None = None) -> None:
+        """Subscribe to its state, and to the status of its task."""
+        own = bus.of_arm(name)
+        self.name, self._robot, self._clock = name, RobotModel.load(robot), bus.clock
+        self._joints, self._scene = own.reader(topics.JOINT_STATES), own.reader(topics.PLANNING_SCENE)
+        self._gripper, self._motion = own.reader(topics.GRIPPER_STATE), own.reader(topics.MOTION_STATUS)
+        self._status = None if status is None else bus.reader(arms_topic(status, name))
+
+    def now(self) -> Partner | None:
+        """Return its newest state; None while something is unknown or its joint states are missing."""
+        joints, gripper, motion = self._joints.latest, self._gripper.latest, self._motion.latest
+        q = None if joints is None else self._robot.order(joints.name, joints.position)
+        if joints is None or q is None or gripper is None or motion is None or (
+                self._clock.now() - joints.header.stamp * 1e-9 > SILENT * self._clock.speed):
+            return None
+        poses = self._robot.link_poses(q)
+        attached = () if self._scene.latest is None else self._scene.latest.attached
+        held = [each.object.model_copy(update={
+            "pose": matrix_to_pose(poses[each.link] @ pose_to_matrix(each.object.pose))})
+            for each in attached if each.link in poses]
+        return Partner(self.name, self._robot.fk(q), gripper, motion, held[0] if held else None,
+                       None if self._status is None else self._status.latest)
 
 
 class OtherArms:

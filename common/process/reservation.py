@@ -65,7 +65,8 @@ class Reservation:
         """Ask for an accepted goal until the hold at its start is released, or it is refused and ended."""
         if self._task is not None:
             self._task.cancel()
-        reserve = ReserveRequest(arm=self.arm, id=request.id, trajectory=request.trajectory)
+        reserve = ReserveRequest(
+            arm=self.arm, id=request.id, trajectory=request.trajectory, may_touch=request.may_touch)
         self._task = asyncio.create_task(self._ask(reserve, arm, held), name="reservation")
 
     async def _ask(self, request: ReserveRequest, arm: Goals, held: Callable[[], bool]) -> None:

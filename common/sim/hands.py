@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from common.config import GripperConfig
-from common.messages import Header, SceneUpdate, WorldEdit, WorldObjects
 from common.robot.finger_joints import closing_frame
 from common.robot.transforms import invert
 from common.sim.bodies import Body
-from common.sim.interface import Numbers, ObjectSnapshot, SimulatedWorld
+from common.sim.interface import SimulatedWorld
 
 Array = NDArray[np.float64]
 
@@ -56,13 +54,6 @@ class WorldOfHands(SimulatedWorld, Protocol):
     def tick_of(self, hand: Hand, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
         """Advance to a time with one of the grippers."""
 
-    def edit_takes_long(self, request: WorldEdit) -> bool:
-        """Whether an edit may take longer than a control cycle."""
-
-    @property
-    def no_seal(self) -> str:
-        """Why a suction cup does not seal on anything, by the newest `obstruction_of`."""
-
 
 class HandInWorld:
     """A kinematic world as one of several grippers meets it: see `common.sim.interface.GripperDrivenWorld`."""
@@ -71,25 +62,9 @@ class HandInWorld:
         """Let this gripper act on the world."""
         self._world, self._hand = world, hand
 
-    @property
-    def version(self) -> int:
-        """Increases with every change of the world."""
-        return self._world.version
-
-    @property
-    def no_seal(self) -> str:
-        """Why a suction cup does not seal on anything, by the newest `obstruction`; empty if it does."""
-        return self._world.no_seal
-
-    @property
-    def ids(self) -> list[str]:
-        """Ids of all objects."""
-        return self._world.ids
-
-    @property
-    def layout(self) -> dict[str, Numbers]:
-        """Initial positions (x, y, z) [m] by id."""
-        return self._world.layout
+    def __getattr__(self, name: str) -> Any:
+        """Return what all grippers share."""
+        return getattr(self._world, name)
 
     def obstruction(self, T_world_tcp: Array, width: float) -> float:
         """Width [m] below which the fingers cannot close."""
@@ -102,27 +77,3 @@ class HandInWorld:
     def tick(self, now: float, T_world_tcp: Array, width: float, gripping: bool) -> None:
         """Advance to a time with this gripper."""
         self._world.tick_of(self._hand, now, T_world_tcp, width, gripping)
-
-    def edit_takes_long(self, request: WorldEdit) -> bool:
-        """Whether an edit may take longer than a control cycle."""
-        return self._world.edit_takes_long(request)
-
-    def edit(self, request: WorldEdit, now: float) -> str:
-        """Change the world as an operator requests."""
-        return self._world.edit(request, now)
-
-    def objects(self, header: Header) -> WorldObjects:
-        """State of all objects."""
-        return self._world.objects(header)
-
-    def take_events(self) -> list[SceneUpdate]:
-        """Return objects removed or come to rest since the last call, in order."""
-        return self._world.take_events()
-
-    def snapshot(self) -> dict[str, ObjectSnapshot]:
-        """Complete state, for `restore`."""
-        return self._world.snapshot()
-
-    def restore(self, objects: Mapping[str, ObjectSnapshot]) -> None:
-        """Restore a state."""
-        self._world.restore(objects)

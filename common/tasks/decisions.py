@@ -217,6 +217,7 @@ class TaskDecisions(Generic[V]):
             id=self.new_id(), stage=move.name, start=start, goal=move.goal, straight=move.straight,
             allowed_collisions=move.touches, attach=move.attach or view.attached if move.carries else "",
             attach_pose=move.attach_pose, release=not move.carries, planning_time=self.p.planning_time,
+            constraints=m.PathConstraints(tool_speed=move.tool_speed) if move.tool_speed else None,
         )
 
     def time_limit(self, stage: Stage) -> float:

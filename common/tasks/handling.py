@@ -244,11 +244,14 @@ class Handling(Task[View]):
 
     def _tools(self, thing: m.CollisionObject, held: m.Pose, goal: m.Pose) -> Iterator[Array]:
         """Yield tool poses (4, 4) that place an object at its goal, for all rotations in which it looks the same."""
+        T_tcp_object = pose_to_matrix(held)
+        if T_tcp_object[2, 2] > 0 and thing.shape == "box":  # upside down, as after a handover: it looks the same
+            T_tcp_object[:3, :3] = T_tcp_object[:3, :3] @ rpy_to_matrix(math.pi, 0.0, 0.0)
         turns = 4 if thing.shape != "box" or abs(thing.dimensions[0] - thing.dimensions[1]) < SQUARE else 2
         for turn in range(turns):
             turned = pose_to_matrix(goal)
             turned[:3, :3] = turned[:3, :3] @ rpy_to_matrix(0.0, 0.0, 2 * math.pi * turn / turns)
-            yield turned @ invert(pose_to_matrix(held))
+            yield turned @ invert(T_tcp_object)
 
     def _aside(self, thing: m.CollisionObject, view: View) -> m.Pose:
         """Return the free position on the table nearest to the tool, within easy reach."""

@@ -57,6 +57,8 @@ class Move(Stage):
     # Digital signals that must have these values from start to end: the arm does not start, or is held on its path.
     requires: Mapping[str, bool] = field(default_factory=dict, kw_only=True)
     start_at: int = field(default=0, kw_only=True)  # cell time at which the arm starts [ns]; 0: at once
+    tool_speed: float | None = field(default=None, kw_only=True)  # highest speed of the tool [m/s]
+    may_touch: list[str] = field(default_factory=list, kw_only=True)  # what another arm carries, for a handover
     trajectory: m.JointTrajectory | None = field(default=None, init=False)
     planned_around: list[tuple[float, float]] = field(default_factory=list, init=False)  # (x, y) of objects [m]
     planned_width: float | None = field(default=None, init=False)  # finger width during the motion [m]
@@ -68,7 +70,7 @@ class Move(Stage):
         assert self.trajectory is not None
         return m.ExecuteRequest(
             id=name, trajectory=self.trajectory, plan=self.plan, scene_stamp=self.scene_stamp,
-            start_at=self.start_at)
+            start_at=self.start_at, may_touch=self.may_touch)
 
     def end(self) -> list[float]:
         """Joint positions at its end [rad]; empty without a plan."""

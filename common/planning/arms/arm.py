@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -158,7 +158,7 @@ class Arm:
         if self.back is not None and np.abs(q - self.back.motion.start).max() > way_back.CLOSE:
             self.back = None
         elif self.back is not None and self.back.body is not self.body:
-            self.back = Moving(self.body, self.back.motion)
+            self.back = replace(self.back, body=self.body)
 
     @property
     def done(self) -> float:

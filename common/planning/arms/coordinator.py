@@ -7,7 +7,7 @@ docs/two_arms.md for why no two requests can wait for each other for ever.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -20,6 +20,7 @@ from common.planning.arms.band import AFTER_RELEASE, braking_time
 from common.planning.arms.pair_world import ArmBody, ArmGeometry
 from common.planning.arms.proofs import Moving, Proofs
 from common.planning.arms.timed_pairs import ArmMotion, Clash, Schedule
+from common.planning.arms.touching import Touch, touch_of
 from common.planning.trajectory import TimedPath
 
 Array = NDArray[np.float64]
@@ -53,6 +54,7 @@ class Retreat:
     goal: str
     path: TimedPath
     why: str
+    may_touch: tuple[str, ...] = ()
 
 
 class Coordinator:
@@ -85,12 +87,15 @@ class Coordinator:
         self.arms[arm].state = state
 
     def carry(self, arm: str, body: ArmBody) -> None:
-        """Record what an arm carries now."""
-        self.arms[arm].body = body
+        """Record what an arm carries now; a waiting motion is proved again with it."""
+        own = self.arms[arm]
+        own.body = body
+        if own.ticket is not None and own.ticket.moving is not None:
+            own.ticket = replace(own.ticket, moving=replace(own.ticket.moving, body=body), possible=False, ways=None)
 
     def request(
         self, arm: str, goal: str, path: TimedPath | None, now: float, body: ArmBody | None = None,
-        may_touch: Iterable[str] = (),
+        may_touch: Sequence[str] = (),
     ) -> Decision:
         """Answer a request, which is repeated until it is granted or refused; cell time [s]."""
         own = self.arms[arm]
@@ -106,8 +111,13 @@ class Coordinator:
             self._tickets += 1
             number = -1 if goal.startswith(RETREAT) else self._tickets
             offset = None if own.state is None or path is None else path.positions[0] - own.state.q
-            moving = None if path is None else Moving(body or own.body, ArmMotion(path, offset), frozenset(may_touch))
+            moving = None if path is None else Moving(body or own.body, ArmMotion(path, offset))
             ticket = own.ticket = Ticket(number, goal, moving, now, now)
+            if moving is not None and path is not None:
+                try:
+                    ticket.moving = replace(moving, touch=self._touch(own, path, may_touch))
+                except ValueError as error:
+                    return self.refuse(own, "may_touch", str(error))
             if problem := self._impossible(own, ticket):
                 return self.refuse(own, "blocked", problem)
         ticket.last = now
@@ -176,15 +186,27 @@ class Coordinator:
         if np.abs(state.q - run.motion.end).max() <= way_back.CLOSE:
             arm.back = run.back
         else:
-            done = run.motion.path
-            cut = way_back.reversed_path(done, state.path_time)
+            cut = way_back.reversed_path(run.motion.path, state.path_time)
             back = None if run.before is None else way_back.behind(way_back.reversed_path(cut), run.before)
-            arm.back = None if back is None else Moving(arm.body, ArmMotion(back))
+            arm.back = None if back is None else self._touching(arm, arm.body, back, run.moving.touch)
         if arm.back is not None and np.abs(state.q - arm.back.motion.start).max() > way_back.CLOSE:
             arm.back = None
         for other in self._others(arm):
             if other.committed is not None:
                 other.committed.parked_for.discard(arm.name)
+
+    def _touch(self, arm: Arm, path: TimedPath, names: Sequence[str]) -> Touch | None:
+        carried = {name: other.body.place(name, other.end.motion.end)
+                   for other in self._others(arm) for name in other.body.carried}
+        return touch_of(arm.geometry.robot, carried, path, names)
+
+    def _touching(self, arm: Arm, body: ArmBody, path: TimedPath, touch: Touch | None) -> Moving:
+        """Return a way back of an arm whose gripper may touch what it touched on its way there."""
+        try:
+            touch = touch and self._touch(arm, path, [touch.object])
+        except ValueError:  # that is not there any more
+            touch = None
+        return Moving(body, ArmMotion(path), touch)
 
     def _line_home(self, arm: Arm, at: Moving) -> Moving | None:
         """Return the straight way home, if the scene of the arm is known to be free there."""
@@ -296,7 +318,7 @@ class Coordinator:
             band = self.options.delays.band(braking, run.braking)
             if clash := prove.in_time(moving, schedule, run.moving, run.schedule, band):
                 return f"{other.name} moves there: " + _named(clash)
-        if other.way_back is not None and (clash := prove.anywhere(other.way_back, end)):
+        if other.way_back is not None and not moving.enters and (clash := prove.anywhere(other.way_back, end)):
             return f"its end is on the way back of {other.name}: " + _named(clash)
         return ""
 
@@ -312,7 +334,8 @@ class Coordinator:
         """Return a way back from the end of a motion that is free while the other arms are at their ends or home."""
         if ticket.ways is None or ticket.ways[0] is not before:
             path = way_back.behind(moving.motion.path, before)
-            ticket.ways = before, _line(arm, ticket.end), None if path is None else Moving(moving.body, ArmMotion(path))
+            ticket.ways = before, _line(arm, ticket.end), None if path is None else self._touching(
+                arm, moving.body, path, moving.touch)
         line, behind = ticket.ways[1:]
         for back in (line if self._is_free(arm, line) else None, behind):
             if back is not None and not any(
@@ -347,6 +370,13 @@ class Coordinator:
             return []
         if arm.is_home or arm.back is None:
             return "is at home" if arm.is_home else "has no proved way back"
+        for other in self._others(arm):
+            clash = None if other.committed is not None else self.proofs.anywhere(arm.rest, other.rest)
+            if clash is not None and clash.certain:  # in a handover
+                if arm.body.carried and other.body.carried:
+                    return f"holds what {other.name} holds, too: open one of the grippers"
+                if arm.back.touch is None and other.back is not None and other.back.touch is not None:
+                    return self.move_back(other, for_arm, since, now)
         if not state.movable:
             return "must not be moved: it is stopped, has a fault, or an operator controls it"
         if arm.ticket is not None:
@@ -354,7 +384,8 @@ class Coordinator:
         self._retreats += 1
         arm.rest_since = now  # another attempt follows after the patience
         return [Retreat(arm.name, f"{RETREAT}{self._retreats}", arm.back.motion.path,
-                        f"out of the way of {for_arm.name}")]
+                        f"out of the way of {for_arm.name}", () if arm.back.touch is None else (
+                            arm.back.touch.object,))]
 
 
 def _line(arm: Arm, at: Moving) -> Moving:

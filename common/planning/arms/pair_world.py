@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from common.messages import AttachedObject
-from common.planning.kernel.world import CONTACT_ALLOWED, KernelWorld, Shape
+from common.planning.kernel.world import KernelWorld, Shape
 from common.planning.obstacles import Solid
 from common.planning.robot_geometry import RobotGeometry
 from common.robot.model import RobotModel
@@ -68,6 +68,7 @@ class ArmBody:
         arm: its geometry.
         levers: (shapes, dof) [m] the farthest that a radian of each joint moves any point of a shape.
         names: (shapes,) of links and carried objects.
+        carried: the latter.
     """
 
     def __init__(
@@ -75,6 +76,14 @@ class ArmBody:
         names: list[str],
     ) -> None:
         self.arm, self.items, self.shapes, self.levers, self.names = arm, items, shapes, levers, names
+        self.carried = names[len(arm.hulls.links):]
+
+    def place(self, name: str, q: Array) -> Array:
+        """Return the center (3,) [m] of a carried object at q (dof,) [rad]."""
+        joint, placement, _ = self.items[len(self.names) - len(self.carried) + self.carried.index(name)]
+        model, data = self.arm.robot.model, self.arm.robot.model.createData()
+        pin.forwardKinematics(model, data, q)
+        return np.asarray((data.oMi[joint] * placement).translation)
 
 
 class PairWorld:
@@ -84,8 +93,8 @@ class PairWorld:
         one_levers, other_levers: (pairs, dof) [m] levers of the first and the second shape of each pair.
     """
 
-    def __init__(self, one: ArmBody, other: ArmBody, may_touch: Collection[str] = ()) -> None:
-        """Pair all moving shapes; the gripper of an arm may touch objects `may_touch` that the other one carries.
+    def __init__(self, one: ArmBody, other: ArmBody) -> None:
+        """Pair all moving shapes.
 
         Raises:
             KernelUnavailable: the kernel is not built, or does not support a joint.
@@ -101,18 +110,17 @@ class PairWorld:
         second = np.array([pair.second for pair in geometry.collisionPairs]) - count
         self.one_levers, self.other_levers = one.levers[first], other.levers[second]
         self._names = [(one.names[i], other.names[j]) for i, j in zip(first, second, strict=True)]
-        self._ignored = np.array([self._may_touch(*pair, may_touch) for pair in self._names])
+        self._carried = [first >= len(one.arm.hulls.links), second >= len(other.arm.hulls.links)]
 
-    def _may_touch(self, a: str, b: str, objects: Collection[str]) -> bool:
-        grippers = a in self.one.arm.gripper and b in self.other.arm.gripper and bool(objects)
-        return grippers or (a in objects and b in self.other.arm.gripper) or (
-            b in objects and a in self.one.arm.gripper) or (a == b and a in objects)
+    def gripper_on(self, touching: int, name: str) -> NDArray[np.bool_]:
+        """Return (pairs,) which are the gripper of arm `touching`, 0 or 1, and an object that the other one carries."""
+        held, gripper = 1 - touching, (self.one, self.other)[touching].arm.gripper
+        named = np.array([pair[touching] in gripper and pair[held] == name for pair in self._names])
+        return np.asarray(named & self._carried[held] & ~self._carried[touching])
 
     def distances(self, q_one: Array, q_other: Array) -> tuple[Array, Array]:
-        """Return (pairs,) [m] upper and lower bounds of all distances; pairs that may touch are far apart."""
-        above, below = self._kernel.distances(np.concatenate([q_one, q_other]))
-        above[self._ignored] = below[self._ignored] = -CONTACT_ALLOWED
-        return above, below
+        """Return (pairs,) [m] upper and lower bounds of all distances."""
+        return self._kernel.distances(np.concatenate([q_one, q_other]))
 
     def names(self, pair: int) -> tuple[str, str]:
         """Return the names of the shapes of a pair."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from common.planning.arms.pair_world import ArmBody, PairWorld
 from common.planning.arms.timed_pairs import ArmMotion, Clash, Effort, PairProof, Schedule
+from common.planning.arms.touching import Touch
 
 Array = NDArray[np.float64]
 
@@ -24,12 +24,17 @@ class Moving:
 
     body: ArmBody
     motion: ArmMotion
-    may_touch: frozenset[str] = frozenset()
+    touch: Touch | None = None
 
     @property
     def arm(self) -> str:
         """Name of the arm."""
         return self.body.arm.name
+
+    @property
+    def enters(self) -> bool:
+        """Whether its gripper is at what another arm carries when it ends."""
+        return self.touch is not None and self.touch.end >= self.motion.duration - 1e-6
 
 
 def resting(body: ArmBody, q: Array) -> Moving:
@@ -44,7 +49,7 @@ class Proofs:
         """Keep this clearance [m]."""
         self.clearance = clearance
         self.effort = Effort()
-        self._worlds: OrderedDict[tuple[int, int, frozenset[str]], PairWorld] = OrderedDict()
+        self._worlds: OrderedDict[tuple[int, int], PairWorld] = OrderedDict()
         self._proofs: OrderedDict[tuple[int, int], tuple[Moving, Moving, PairProof]] = OrderedDict()
 
     @property
@@ -68,19 +73,25 @@ class Proofs:
         key = id(one), id(other)
         found = self._proofs.get(key)
         if found is None:
-            proof = PairProof(self._world(one, other), one.motion, other.motion, self.clearance, self.effort)
+            proof = self._proof(one, other)
             found = self._proofs[key] = one, other, proof  # the motions are referenced: their ids stay unique
             if len(self._proofs) > _MOST_PROOFS:
                 self._proofs.popitem(last=False)
         self._proofs.move_to_end(key)
         return found[2]
 
+    def _proof(self, one: Moving, other: Moving) -> PairProof:
+        world = self._world(one, other)
+        allowed = [(arm, moving.touch.begin, moving.touch.end, world.gripper_on(arm, moving.touch.object))
+                   for arm, (moving, rests) in enumerate(((one, other), (other, one)))
+                   if moving.touch is not None and rests.motion.rests]
+        return PairProof(world, one.motion, other.motion, self.clearance, self.effort, allowed)
+
     def _world(self, one: Moving, other: Moving) -> PairWorld:
-        touched: Collection[str] = one.may_touch | other.may_touch
-        key = id(one.body), id(other.body), frozenset(touched)
+        key = id(one.body), id(other.body)
         found = self._worlds.get(key)
         if found is None:
-            found = self._worlds[key] = PairWorld(one.body, other.body, touched)
+            found = self._worlds[key] = PairWorld(one.body, other.body)
             if len(self._worlds) > _MOST_WORLDS:
                 self._worlds.popitem(last=False)
         self._worlds.move_to_end(key)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 Cell = tuple[float, float, float, float]  # from, to [s] on the first trajectory, from, to [s] on the second
 
 _PIECE = 0.025  # [s] longest piece of a cubic whose speed is bounded at once
+_INSTANT = 1e-6  # [s]
 _FINEST = 0.002  # [m] cells in which no link moves farther are not divided
 SPEEDING_UP = 0.08  # [s] of a motion that an arm may be ahead, as it speeds up to the rate of its schedule
 NOT_AT_REST = -1e9
@@ -63,6 +64,11 @@ class ArmMotion:
         """Return a motion that stays at q (dof,) [rad]."""
         still = np.zeros((2, len(q)))
         return cls(TimedPath(np.array([0.0, 1e-3]), np.array([q, q], dtype=float), still, still))
+
+    @property
+    def rests(self) -> bool:
+        """Whether it stays where it is."""
+        return not self._travel[-1].any()
 
     def at(self, time: float) -> Array:
         """Return the positions (dof,) [rad] at its own time [s]."""
@@ -142,6 +148,7 @@ class PairProof:
     Attributes:
         world: the two arms; one, other: their motions; clearance: to keep [m].
         effort: shared with other proofs.
+        allowed: arm, 0 or 1, from, to [s] of its motion, and the pairs (pairs,) that may touch meanwhile.
         evaluations: how many cells were measured.
     """
 
@@ -150,6 +157,7 @@ class PairProof:
     other: ArmMotion
     clearance: float
     effort: Effort = field(default_factory=Effort)
+    allowed: Sequence[tuple[int, float, float, NDArray[np.bool_]]] = ()
     evaluations: int = 0
     _measured: dict[Cell, _Measured] = field(default_factory=dict)
     _last: tuple[Cell, Clash] | None = None
@@ -209,6 +217,11 @@ class PairProof:
         self.evaluations += 1
         self.effort.left -= 1
         above, below = self.world.distances(self.one.at(a), self.other.at(b))
+        for arm, begin, end, pairs in self.allowed:
+            if begin <= (a, b)[arm] <= end:
+                above[pairs] = np.inf
+            if begin <= cell[2 * arm] and cell[2 * arm + 1] <= end + _INSTANT:
+                below[pairs] = np.inf
         one = self.world.one_levers @ self.one.reach(a0, a, a1)
         other = self.world.other_levers @ self.other.reach(b0, b, b1)
         slack = below - one - other - self.clearance

@@ -1,0 +1,5 @@
+"""Handover: one arm picks what the camera sees and hands it to the other arm, which puts it into its box."""
+
+from common.application import Application
+
+APPLICATION = Application(topics="applications.handover.topics:TOPICS", task="hander", grasps=True)

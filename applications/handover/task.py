@@ -1,0 +1,51 @@
+"""The tasks of both arms: the giver picks what the camera sees, the receiver puts it into its container."""
+
+from __future__ import annotations
+
+from common import messages as m
+from common.tasks.handover import WAITS, Giving, HandoverView, Receiving
+from common.tasks.stages import View
+
+
+class Giver(Giving):
+    """Gives one object after the other."""
+
+    def choose(self, view: View) -> None:
+        """Pick the next object, or end when none is left and the other arm holds none."""
+        assert isinstance(view, HandoverView)
+        partner, things = view.partner, view.objects("target")
+        if self.ends_with(partner, view):
+            return
+        if things:
+            self.bring(things, view)
+        elif partner is not None and not partner.gripper.holding:
+            self.finish(view)
+
+    def note(self, view: View) -> None:
+        """Count what was ever seen: what lies on the table, is held, or is in the box of the other arm."""
+        assert isinstance(view, HandoverView)
+        if self.shown(view) and view.partner is not None and view.partner.status is not None:
+            there = len(view.objects("target")) + view.partner.gripper.holding + view.partner.status.done
+            self.status.total = max(self.status.total, there)
+
+
+class Receiver(Receiving):
+    """Puts what it takes into the container next to it."""
+
+    def choose(self, view: View) -> None:
+        """Wait for an offer; end with the task of the giver."""
+        assert isinstance(view, HandoverView)
+        partner = view.partner
+        if partner is not None and partner.status is not None and partner.status.state == "DONE":
+            self.finish(view)
+        elif not self.ends_with(partner, view):
+            self.status.message = f"{WAITS} {self.p.partner} offers an object"
+
+    def destination(self, thing: m.CollisionObject, view: View) -> m.Pose | None:
+        """Return the pose above the freest corner of the container."""
+        return self.room_in(next(iter(self.p.world.containers)), thing, view)
+
+    def note(self, view: View) -> None:
+        """Count what the camera shows in the container."""
+        if self.shown(view):
+            self.status.done = len(self.inside(next(iter(self.p.world.containers)), view))

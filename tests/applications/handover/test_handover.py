@@ -1,0 +1,139 @@
+"""The handover cell on a virtual clock: a complete run, a receiver that misses, and STOP while objects change hands."""
+
+import asyncio
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from applications.handover.topics import HANDOVER_STATUS
+from common import messages as m
+from common import topics
+from common.arms import arms_topic
+from common.config import Cell, load_cell
+from common.robot.model import RobotModel
+from common.tasks.handover import Receiving, _backward
+from common.tasks.stages import Move
+from common.transport.bus import Bus
+from lab.simulation import Simulation
+from tests.two_arms import judged
+
+ARMS = ("left", "right")
+ONE = ('world.objects=[{id: part_1, shape: box, size: [0.05, 0.04, 0.06], x: 0.5, y: 0.35, yaw: 0.3, '
+       'color: [0.9, 0.1, 0.1]}]')
+
+
+def cell(*settings: str) -> Cell:
+    return load_cell("handover", [ONE, "services.depth_camera.rate=1.0", *settings], seed=1)
+
+
+class Watch:
+    """Joint positions of both arms at the same time, and what both grippers report."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.bus = bus
+        self.joints = {arm: bus.reader(arms_topic(topics.JOINT_STATES, arm)) for arm in ARMS}
+        self.grippers = {arm: bus.reader(arms_topic(topics.GRIPPER_STATE, arm)) for arm in ARMS}
+        self.status = {arm: bus.reader(arms_topic(HANDOVER_STATUS, arm)) for arm in ARMS}
+        self.truth = bus.reader(topics.SCENE_OBJECTS)
+
+    def positions(self) -> tuple[np.ndarray, ...]:
+        return tuple(np.array(self.joints[arm].latest.position[:7]) for arm in ARMS)  # type: ignore[union-attr]
+
+    def holding(self) -> list[str]:
+        return [arm for arm in ARMS if (state := self.grippers[arm].latest) is not None and state.holding]
+
+    def height(self) -> float:
+        assert self.truth.latest is not None
+        return self.truth.latest.objects[0].pose.position.z
+
+    async def until(self, arm: str, stage: str) -> None:
+        while (await self.status[arm].next()).stage != stage:
+            pass
+
+
+@pytest.mark.slow
+def test_part_goes_from_hand_to_hand_into_the_box_and_the_arms_keep_their_clearance() -> None:
+    states: list[tuple[np.ndarray, ...]] = []
+    changes: list[list[str]] = [[]]
+
+    async def visit(bus: Bus) -> None:
+        watch = Watch(bus)
+        while (status := watch.status["right"].latest) is None or status.state not in ("DONE", "ERROR"):
+            await watch.joints["right"].next()
+            if watch.joints["left"].latest is not None:
+                states.append(watch.positions())
+            if watch.holding() != changes[-1]:
+                changes.append(watch.holding())
+
+    config = cell()
+    outcome = Simulation(config, 1, visit=visit).run()
+    assert (outcome.state, outcome.done, outcome.total, outcome.crashes) == ("DONE", 1, 1, []), outcome
+    assert changes == [[], ["left"], ["left", "right"], ["right"], []]
+    robots = [RobotModel.load(robot) for robot in config.robots.values()]
+    assert min(judged(*robots, states, 0.02)) > 0.02  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def short_of_the_object(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Let the receiver reach short of the object while the list is not empty."""
+    attempts: list[str] = []
+    line = Receiving._line
+
+    def shorter(self: Receiving, name: str, *rest: object) -> Move:
+        if name == "reach" and attempts:
+            attempts.pop()
+            state, cycle, ends, *others = rest
+            rest = (state, cycle, [_backward(end, 0.06) for end in ends], *others)  # type: ignore[attr-defined]
+        return line(self, name, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Receiving, "_line", shorter)
+    yield attempts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("misses", [1, 2])
+def test_receiver_that_misses_tries_again_or_ends_and_the_giver_holds_on(
+    misses: int, short_of_the_object: list[str]
+) -> None:
+    short_of_the_object += ["again"] * misses
+    seen: list[tuple[list[str], float]] = []
+
+    async def visit(bus: Bus) -> None:
+        watch = Watch(bus)
+        await watch.until("right", "close")
+        while (await watch.grippers["right"].next()).state == "active":
+            pass
+        seen.append((watch.holding(), watch.height()))
+        while watch.status["left"].latest is None or watch.status["left"].latest.state not in ("DONE", "ERROR"):
+            await watch.status["left"].next()
+        seen.append((watch.holding(), watch.height()))
+
+    outcome = Simulation(cell("services.right_hander.most_tries=2"), 1, visit=visit).run()
+    assert seen[0] == (["left"], pytest.approx(0.45, abs=0.02))
+    if misses == 1:
+        assert (outcome.state, outcome.done, outcome.total) == ("DONE", 1, 1), outcome
+    else:
+        assert outcome.state == "ERROR" and "the fingers closed on nothing" in outcome.message, outcome
+        assert "left: the task of right has ended" in outcome.message
+        assert seen[1] == (["left"], pytest.approx(0.45, abs=0.02))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("arm", "stage"), [("right", "reach"), ("right", "close"), ("left", "hand over"),
+                                            ("left", "withdraw")])
+def test_stop_while_a_part_changes_hands_drops_nothing_and_only_a_start_continues(arm: str, stage: str) -> None:
+    async def visit(bus: Bus) -> None:
+        watch = Watch(bus)
+        await watch.until(arm, stage)
+        await asyncio.sleep(0.1)
+        await bus.client(topics.MOTION_STOP).call(m.StopRequest(reason="test"))
+        await asyncio.sleep(1.0)
+        before, held = watch.positions(), watch.holding()
+        await asyncio.sleep(5.0)
+        assert np.abs(np.subtract(watch.positions(), before)).max() < 1e-6
+        assert watch.holding() == held and held and watch.height() == pytest.approx(0.45, abs=0.02)
+        await bus.client(topics.TASK_COMMAND).call(m.TaskCommand(command="start"))
+
+    outcome = Simulation(cell(), 1, visit=visit).run()
+    assert (outcome.state, outcome.done, outcome.total, outcome.crashes) == ("DONE", 1, 1, []), outcome
