@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
-from applications.handover.task import Giver, Receiver
-from applications.handover.topics import HANDOVER_STATUS
+from applications.hand_over.task import Giver, Receiver
+from applications.hand_over.topics import HANDOVER_STATUS
 from common.process.other_arms import OtherArm
 from common.process.service import main
 from common.process.task_runner import run_task

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from applications.handover.topics import HANDOVER_STATUS
+from applications.hand_over.topics import HANDOVER_STATUS
 from common import messages as m
 from common import topics
 from common.arms import arms_topic

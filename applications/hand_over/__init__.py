@@ -2,4 +2,4 @@
 
 from common.application import Application
 
-APPLICATION = Application(topics="applications.handover.topics:TOPICS", task="hander", grasps=True)
+APPLICATION = Application(topics="applications.hand_over.topics:TOPICS", task="hander", grasps=True)
