@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -17,6 +16,7 @@ from common.tasks.stages import Cycle, Grip, Move, Stage, View, place_of
 from common.tasks.tracking import Expected, pick_stages, time_grip
 
 SKIPPED_FOR = 0.4  # [s] after a failed plan: the object is elsewhere then
+LONGEST_LEAD = 4.0  # [s] on a host that plans slowly
 SAME_SPEED = 0.012  # [m/s] between belt and object: it moves with the belt
 STEADY = 0.002  # [m/s] of the belt to its set speed: it neither starts nor brakes
 
@@ -72,6 +72,7 @@ class BeltPicking(Handling):
         self._expected: Expected | None = None
         self._skipped: dict[str, float] = {}  # until when, by object [s]
         self._attempts = 0
+        self._lead = config.lead_time  # [s] more while plans come too late
 
     # --- decisions -----------------------------------------------------------------------------------------------
 
@@ -119,7 +120,7 @@ class BeltPicking(Handling):
 
     def _is_near(self, way: float, thing: m.CollisionObject) -> bool:
         """Return whether an object will be in the window when the arm can be there; it is not met long before."""
-        return way + self._speed_of(thing) * 2 * self.p.lead_time >= self.p.window[0]
+        return way + self._speed_of(thing) * 2 * self._lead >= self.p.window[0]
 
     def _speed_of(self, thing: m.CollisionObject) -> float:
         (c, s), v = self._belt.direction, thing.velocity
@@ -136,8 +137,9 @@ class BeltPicking(Handling):
         x, y, z = place_of(thing.pose)
         ways = grasp_directions(thing, self.gripper.closing_axis, self.gripper.max_width)
         yaw, width = min(ways, key=self._sideways)
-        stamp, begin = view.scene.header.stamp, round((view.now + self.p.lead_time) * 1e9)
-        self._expected = Expected(self._name, view.belts.header.stamp * 1e-9, belt.position, belt.speed, math.inf)
+        stamp, begin = view.scene.header.stamp, round((view.now + self._lead) * 1e9)
+        self._expected = Expected(self._name, view.belts.header.stamp * 1e-9, belt.position, belt.speed,
+                                  begin * 1e-9)
         self.queue += pick_stages(
             tool_down(x, y, self.p.grasp.height(z), yaw), thing, stamp, begin, self.gripper, Cycle(thing.id),
             width=width or 0.0, opening=view.gripper.width if view.gripper else 0.0,
@@ -174,19 +176,27 @@ class BeltPicking(Handling):
 
     def may_start(self, stage: Stage, view: View) -> bool:
         """Return whether a stage may start: the belt moves as planned, and the time to start is not over."""
-        if stage.name == "track" and isinstance(stage, Move) and (
-            self._deviates(view) or view.now > stage.start_at * 1e-9
-        ):
-            self.clear()
-            return False
+        if stage.name == "track" and isinstance(stage, Move):
+            late = view.now - stage.start_at * 1e-9
+            if late > 0.0:
+                self._lead = min(self._lead + late + self.p.lead_time, LONGEST_LEAD)
+            if late > 0.0 or self._deviates(view):
+                self.clear()
+                return False
         return super().may_start(stage, view)
 
     def outdated(self, stage: Stage, view: View) -> str:
         """Return why the object is not where the motion leads, until the fingers begin to close."""
         assert view.motion is not None
-        if stage.name != "track" or self._expected is None or view.now >= self._expected.closes:
+        if stage.name != "track" or not isinstance(stage, Move) or self._expected is None:
             return ""
-        if view.motion.held or view.motion.speed_scaling < 1.0:
+        late = 0.0
+        if view.motion.plan == stage.plan:
+            late = self._expected.lag(view.motion)
+        if view.now >= self._expected.closes + max(late, 0.0):
+            return ""
+        if view.motion.held or view.motion.speed_scaling < 1.0 or (
+                late * abs(self._expected.speed) > self.p.deviation):
             return "the arm is late for the object"
         return self._deviates(view)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from common.control.goals import MAX_SAMPLES, Assessment, ForceControl, Goal, GoalReports, time_at
+from common.control.goals import MAX_SAMPLES, Assessment, ForceControl, Goal, GoalReports, possible_rate, time_at
 from common.control.limiter import Limiter
 from common.control.set_point_gaps import SetPointGaps
 from common.control.set_points import Standstill
@@ -64,7 +64,9 @@ class Acceptance:
         rate = 0.0 if self._reports.holds else self._reports.speed_scaling * assessment.share
         accepted = assessment.goal(name, start, now, rate, self._limits)
         accepted.force = None if force is None else force(assessment.trajectory, start)
-        accepted.time = time_at(now, start_at) if start_at else 0.0
+        if start_at:
+            accepted.time, accepted.start_at = time_at(now, start_at), start_at
+            accepted.fastest = possible_rate(accepted, self._limits, self._period)
         if start is not self._standstill.position:
             self._standstill.locate(measured)
         self._standstill.goal_accepted()

@@ -16,7 +16,7 @@ from common.control.trajectory import Trajectory
 from common.control.wrench import Wrenches
 from common.errors import Refused
 from common.hardware.interface import Limits, Vector
-from common.hardware.pace import Pace
+from common.hardware.pace import CATCH_UP, Pace
 from common.messages import GoalState, Holder, Interlock, MotionStatus
 
 S = TypeVar("S", bound=BaseModel)
@@ -26,6 +26,7 @@ REMEMBERED = 1000  # goals that were followed, and as many that were refused; ol
 BLEND_TIME = 0.3  # [s] in which the difference between the robot's and the trajectory's start fades
 BLEND_SHARE = 0.5  # of the limits is for that difference at most; else it takes longer
 SLOWEST = 0.01  # share of its speed below which a trajectory is refused
+ON_TIME, CATCH_UP_TIME = 1e-3, 0.3  # [s] of lag that is none, and in which a goal would catch up with the rest
 LATE_START, LONGEST_WAIT = 0.02, 30.0  # [s] for a goal with a time to start
 MAX_SAMPLES = 20_000  # of a trajectory, to find how fast it can be followed
 
@@ -73,6 +74,8 @@ class Goal:
     pace: Pace
     share: float = 1.0
     time: float = 0.0  # negative: it waits for its start
+    start_at: float = -math.inf  # cell time at which it is to start: it catches up with that [s]
+    fastest: float = 1.0  # rate at which it may catch up
     begin: float = 0.0  # time at which the trajectory of the request starts: later than 0 if it joined another goal
     behind: float = 0.0  # distance of the newest set-point from the path [rad]
     stopping: bool = False
@@ -111,6 +114,11 @@ class Goal:
         u = np.clip(times / self.blend, 0.0, 1.0) if self.blend > 0 else np.ones_like(times)
         return self.trajectory.positions_at(times) + _remaining(u)[:, None] * self.offset
 
+    def rate_on_schedule(self, now: float) -> float:
+        """Return the rate, 1 to `fastest`, at which the goal follows or reaches its schedule."""
+        lag = now - self.start_at - self.time
+        return min(1.0 + max(lag - ON_TIME, 0.0) / CATCH_UP_TIME, self.fastest)
+
     def progress(self, delay: float) -> float:
         """Return the progress of an arm that follows its set-points after a delay [s]; it never decreases."""
         done = self.time - delay * self.pace.rate
@@ -141,22 +149,32 @@ def possible_share(goal: Goal, limits: Limits, period: float) -> float:
     Raises:
         Refused: it is below SLOWEST.
     """
-    share, most = 1.0, 1 + SLACK
+    share = 1.0
     while share >= SLOWEST:
-        step = share * period / 2  # of the trajectory's time: differences over two, starting at every second one
-        count = min(int((goal.duration - goal.time) / step) + 1, MAX_SAMPLES)
-        q = goal.positions_at(goal.time + np.arange(-6.0, count + 6) * step)
-        v = (q[2:] - q[:-2]) / period
-        a = (v[2:] - v[:-2]) / period
-        j = (a[2:] - a[:-2]) / period
-        over = max(float((np.abs(v) / limits.velocity).max()) / most,
-                   math.sqrt(float((np.abs(a) / limits.acceleration).max()) / most),
-                   float(np.cbrt((np.abs(j) / limits.jerks).max() / most)))
+        over = _excess(goal, limits, period, share, 1 + SLACK)
         if over <= 1.0:
             return share
         share /= 1.01 * over
     raise Refused("contradiction", "its points are too far apart for their times: it could only be followed at less "
                                    f"than {SLOWEST:.0%} of its speed")
+
+
+def possible_rate(goal: Goal, limits: Limits, period: float) -> float:
+    """Return the rate, 1 to CATCH_UP, at which a goal may catch up with its schedule: all of it keeps the limits."""
+    return min(max(1 / max(_excess(goal, limits, period, 1.0, 1.0), 1e-9), 1.0), CATCH_UP)
+
+
+def _excess(goal: Goal, limits: Limits, period: float, share: float, most: float) -> float:
+    """Return the factor by which the rest of a goal, at a share of its speed, is faster than `most` of the limits."""
+    step = share * period / 2  # of the trajectory's time: differences over two, starting at every second one
+    count = min(int((goal.duration - goal.time) / step) + 1, MAX_SAMPLES)
+    q = goal.positions_at(goal.time + np.arange(-6.0, count + 6) * step)
+    v = (q[2:] - q[:-2]) / period
+    a = (v[2:] - v[:-2]) / period
+    j = (a[2:] - a[:-2]) / period
+    return max(float((np.abs(v) / limits.velocity).max()) / most,
+               math.sqrt(float((np.abs(a) / limits.acceleration).max()) / most),
+               float(np.cbrt((np.abs(j) / limits.jerks).max() / most)))
 
 
 def time_at(now: float, start_at: float) -> float:

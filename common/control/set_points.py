@@ -226,6 +226,8 @@ class GoalFollower:
         share = max(speed_scaling, goal.pace.rate)
         goal.pace.ramp_up = SHORTEST_STOP if speed_scaling * goal.share < goal.pace.rate else RAMP_UP
         catching_up = max(0.0, 1 - goal.behind / BEHIND)
+        if speed_scaling == 1.0:
+            catching_up *= goal.rate_on_schedule(now)
         goal.time = goal.pace.advance(
             goal.at, goal.time, 0.0 if braking else speed_scaling * goal.share * catching_up,
             min(max(now - goal.last, 0.0), longest),
@@ -236,7 +238,7 @@ class GoalFollower:
         position, change = goal.at(goal.time)
         self._standstill.position = position
         set_point, velocity = self._limiter.step(
-            position, change * goal.pace.rate, elapsed, max(share, goal.pace.rate), braking
+            position, change * goal.pace.rate, elapsed, min(max(share, goal.pace.rate), 1.0), braking
         )
         goal.behind = float(np.abs(position - set_point).max())
         over = goal.time >= goal.duration or (goal.stopping and goal.pace.rate == 0.0)

@@ -14,16 +14,17 @@ Path = Callable[[float], tuple[Vector, Vector]]  # trajectory time [s] to q (dof
 
 SHORTEST_STOP = 0.03  # [s] cell time in which the rate falls from 1 to 0 at best
 RAMP_UP = 0.3  # [s] cell time in which it rises from 0 to 1, or follows a change of the requested speed
+CATCH_UP = 1.15  # rate at most of a trajectory that is behind its schedule; `tracking` plans with that reserve
 HALVINGS = 10  # of the interval in which the largest allowed change is searched
 REACHED = 1e-9  # closer to its target, the rate is there
 
 
 @dataclass
 class Pace:
-    """The rate of a trajectory's time, and how it changes.
+    """The rate of a trajectory's time, and how it changes; above 1 only to catch up with a schedule.
 
     Attributes:
-        rate: seconds of trajectory time per second of cell time, 0 to 1.
+        rate: seconds of trajectory time per second of cell time, 0 to CATCH_UP.
         slope: change of the rate in the newest step [1/s].
         ramp_up: cell time in which it rises from 0 to 1 at best [s].
         acceleration: mean of the joints (dof,) in that step [rad/s^2].

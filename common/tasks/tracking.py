@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from common.tasks.stages import Cycle, Grip, Move, Stage
 
 Array = npt.NDArray[np.float64]
 
+CAUGHT_UP = 0.1  # share of the time that is left in which a late arm catches up
 SETTLE = 0.2  # [s] that the fingers have more than they need to close at full speed
 
 
@@ -25,7 +27,14 @@ class Expected:
     stamp: float  # of the encoder reading [s]
     position: float  # of the belt then [m]
     speed: float  # [m/s]
-    closes: float = 0.0  # cell time at which the fingers start to close [s]
+    begins: float = 0.0  # cell time at which the arm starts [s]
+    closes: float = math.inf  # cell time at which the fingers start to close [s]
+
+    def lag(self, motion: m.MotionStatus) -> float:
+        """Return how late the arm will be as the fingers start to close, if it catches up until then [s]."""
+        lag = motion.header.stamp * 1e-9 - self.begins - motion.path_time
+        left = self.closes - self.begins - motion.path_time
+        return lag - CAUGHT_UP * max(left, 0.0)
 
     def deviation(self, state: m.ConveyorState | None) -> float:
         """Return how far the object will be from where it was expected when the fingers close, along the belt [m]."""
