@@ -14,7 +14,7 @@ Path = Callable[[float], tuple[Vector, Vector]]  # trajectory time [s] to q (dof
 
 SHORTEST_STOP = 0.03  # [s] cell time in which the rate falls from 1 to 0 at best
 RAMP_UP = 0.3  # [s] cell time in which it rises from 0 to 1, or follows a change of the requested speed
-CATCH_UP = 1.15  # rate at most of a trajectory that is behind its schedule; `tracking` plans with that reserve
+CATCH_UP = 1.15  # rate at most of a trajectory that is behind its schedule
 HALVINGS = 10  # of the interval in which the largest allowed change is searched
 REACHED = 1e-9  # closer to its target, the rate is there
 

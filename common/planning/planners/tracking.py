@@ -3,7 +3,7 @@
 The tool's motion is the sum of the target's displacement and a motion in the target's own frame. The meeting time
 is found by iteration: an approach of a given duration determines where the target is then, and so the trajectory; the
 shortest approach is used whose joint motion is within all limits. All sections are quintics in time, so accelerations
-are continuous. A reserve to the limits lets the executor catch up after late cycles.
+are continuous.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from common.config import Parameters
-from common.hardware.pace import CATCH_UP
 from common.planning.ik import converge
 from common.planning.problem import NOT_APPLICABLE, Cancel, Moving, Problem, Result
 from common.planning.trajectory import TimedPath
@@ -108,9 +107,8 @@ def _joint_path(problem: Problem, goal: Moving, sections: Sections) -> tuple[Tim
     positions = np.array(path)
     velocities, accelerations = clamped_spline(times, positions)
     jerk = np.abs(np.diff(accelerations, axis=0)) / np.diff(times)[:, None]
-    over = np.maximum(CATCH_UP * np.abs(velocities) / problem.velocity,
-                      CATCH_UP**2 * np.abs(accelerations) / problem.acceleration).max(axis=1)
-    over[1:] = np.maximum(over[1:], (CATCH_UP**3 * jerk / problem.jerk).max(axis=1))
+    over = np.maximum(np.abs(velocities) / problem.velocity, np.abs(accelerations) / problem.acceleration).max(axis=1)
+    over[1:] = np.maximum(over[1:], (jerk / problem.jerk).max(axis=1))
     late = float(times[int(np.argmax(over > 1.0))]) if over.max() > 1.0 else None
     return TimedPath(times, positions, velocities, accelerations), late
 
