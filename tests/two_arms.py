@@ -116,10 +116,13 @@ class TwoArms:
         def answer() -> None:
             if not self.alive:
                 return
+            if "coordinator" not in own.controller.reports.holds:
+                self.later(0.25, lambda: self._ask(own, goal, path))
+                return
             decision = self.coordinator.request(own.name, goal, path, self.now)
             if decision.state == "refused":
                 self.later(self.message, lambda: self._refused(own, goal, decision.error, decision.message))
-            elif decision.state == "wait":
+            else:
                 self.later(0.25, lambda: self._ask(own, goal, path))
 
         self.later(self.message, answer)

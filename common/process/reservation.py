@@ -62,7 +62,7 @@ class Reservation:
         return None
 
     def ask_for(self, request: ExecuteRequest, arm: Goals, held: Callable[[], bool]) -> None:
-        """Ask for an accepted goal until the hold at its start is released, or it is refused and ended."""
+        """Ask for an accepted goal while the coordinator holds it, at its start or on its path, until it is over."""
         if self._task is not None:
             self._task.cancel()
         reserve = ReserveRequest(
@@ -71,7 +71,11 @@ class Reservation:
 
     async def _ask(self, request: ReserveRequest, arm: Goals, held: Callable[[], bool]) -> None:
         answered = monotonic()
-        while arm.goal == request.id and held():
+        while arm.goal == request.id:
+            if not held():
+                answered = monotonic()
+                await asyncio.sleep(REPEAT / self._clock.speed)
+                continue
             request.header = Header(stamp=self._clock.now_ns())
             try:
                 reply = await self._client.call(request, TIMEOUT)

@@ -224,6 +224,9 @@ class Coordinator:
         assert ticket is not None
         ticket.waits_for.clear()
         ticket.reason = ""
+        if arm.committed is None and arm.state and arm.state.goal == ticket.goal and arm.state.path_time > PAST:
+            self.refuse(arm, "restarted", "the coordinator that held it on its path was restarted")
+            return
         if not ticket.possible and (problem := self._impossible(arm, ticket)):
             self.refuse(arm, "blocked", problem)
             return

@@ -17,7 +17,6 @@ from common.planning.arms.timed_pairs import NOT_AT_REST, Schedule
 
 RETRY = 0.1  # [s] between attempts to prove new schedules
 LEAST_RATE = 0.05
-UNKNOWN = 3.0  # [s] after which a held motion without a request ends
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,6 @@ class ScheduleKeeper:
         self._all = coordinator
         self._tried = -1e9  # cell time of the last attempt to prove new schedules [s]
         self._obstructed: dict[str, float] = {}  # goals that an arm at rest obstructs, since when [s]
-        self._unknown: dict[str, float] = {}  # held goals that were not requested, since when [s]
 
     def step(self, now: float) -> list[Retreat | Cancel]:
         """Set which arms to hold; return what else must be requested; cell time [s]."""
@@ -56,18 +54,7 @@ class ScheduleKeeper:
         actions = self._obstructions(running, holds, now)
         for arm in self._all.arms.values():
             arm.hold = holds.get(arm.name, "")
-        return actions + self._unknown_goals(now)
-
-    def _unknown_goals(self, now: float) -> list[Retreat | Cancel]:
-        """End motions that a coordinator held on their paths before it was restarted: no request follows for them."""
-        held = {arm.state.goal: arm.name for arm in self._all.arms.values()
-                if arm.state is not None and arm.state.held and arm.state.goal
-                and (arm.committed is None or arm.committed.goal != arm.state.goal)
-                and (arm.ticket is None or arm.ticket.goal != arm.state.goal)}
-        self._unknown = {goal: self._unknown.get(goal, now) for goal in held}
-        over = [goal for goal, since in self._unknown.items() if now - since > UNKNOWN]
-        self._unknown |= dict.fromkeys(over, now)
-        return [Cancel(held[goal], goal, "the coordinator that held it was restarted") for goal in over]
+        return actions
 
     def _lag(self, arm: Arm, now: float) -> float:
         return arm.lag(now, self._all.options.delays.report)
