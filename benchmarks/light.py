@@ -84,9 +84,9 @@ def main() -> None:
         rng = np.random.default_rng((options.seed, number))
         places, light, joints = balls(rng, around), scenery(rng, "mujoco"), at_random(robot, rng)
         sensor = CameraParameters(auto_exposure=True, full_well=10_000, white_balance="off" if number % 2 else "auto")
-        eye = SimulatedCamera(around, light, cell.robot, sensor, rng, plain=True,
+        eye = SimulatedCamera(around, light, [cell.robot], sensor, rng, plain=True,
                               lens=Lens(camera, distorted=True, rectify=True))
-        picture = eye.capture(WorldObjects(objects=objects(places, around)), joints, 0).colour
+        picture = eye.capture(WorldObjects(objects=objects(places, around)), [joints], 0).colour
         q = robot.order(joints.name, joints.position)
         assert q is not None
         hidden = silhouettes.occlusion(eye.pinhole, [q])

@@ -53,7 +53,7 @@ def draw_one(name: str, count: int) -> None:
         ("OpenGL with shadows", Scenery(), False, select_gl()), ("the same, and depth", Scenery(), True, select_gl()),
         ("OpenGL without shadows", EVEN, False, select_gl()), ("rays, with depth", EVEN, True, ""),
     ):
-        renderer = PhysicsRenderer(cell.world, scenery, robot, camera, depth=depth, gl=gl)
+        renderer = PhysicsRenderer(cell.world, scenery, [robot], camera, depth=depth, gl=gl)
         states = [at_home(robot, 0.01 * number) for number in range(2)]
 
         def draw(renderer: PhysicsRenderer = renderer, states: list[JointState] = states) -> object:
@@ -78,7 +78,7 @@ def errors() -> None:
     cell = load_cell("panda")
     robot, camera = RobotModel.load(cell.robot), Pinhole.from_config(cell.world.camera)
     objects: list[WorldObject] = load_world(cell.world, cell.world.objects).objects(Header()).objects
-    seen = PhysicsRenderer(cell.world, EVEN, robot, camera, depth=False, gl=select_gl()).render(
+    seen = PhysicsRenderer(cell.world, EVEN, [robot], camera, depth=False, gl=select_gl()).render(
         objects, at_home(robot, 2.8)).colour.astype(int)
     red = (seen[..., 2] > 60) & (seen[..., 2] > 3 * seen[..., :2].max(axis=2))
     _, _, _, middles = cv2.connectedComponentsWithStats(red.astype(np.uint8))

@@ -35,7 +35,7 @@ class Config(CameraParameters):
     distorted: bool = Field(False, description="apply the distortion d of the world's camera")
     rectify: bool = Field(True, description="with distorted: rectify as camera_opencv does; false publishes distorted "
                                             "images, and d in camera_info: the detectors reject them")
-    draw_robot: bool = Field(False, description="show the arm, which occludes objects as in a real image")
+    draw_robot: bool = Field(False, description="show the arms, which occlude objects as in a real image")
 
 
 async def run(bus: Bus, config: Config) -> None:
@@ -48,14 +48,15 @@ async def run(bus: Bus, config: Config) -> None:
     frame = config.world.camera.frame
     rng = np.random.default_rng(config.run.seed)
     lens = Lens(config.world.camera, distorted=config.distorted, rectify=config.rectify)
-    camera = SimulatedCamera(config.world, config.scenery, config.robot, config, rng, plain=True, lens=lens,
+    arms = config.arms.including(config.robot)
+    camera = SimulatedCamera(config.world, config.scenery, list(arms.values()), config, rng, plain=True, lens=lens,
                              arm=config.draw_robot)
     # Declared in every case: access rules come from the declarations, with whatever simulator they are made.
-    joints = bus.of_arm(config.arms.first).reader(topics.JOINT_STATES, listening=camera.needs_joints)
+    joints = [bus.of_arm(arm).reader(topics.JOINT_STATES, listening=camera.needs_joints) for arm in arms]
     await bus.ready()
     await truth.next()
-    if camera.needs_joints:
-        await joints.next()
+    for each in joints if camera.needs_joints else ():
+        await each.next()
     infos.put(camera.info(bus.header(frame)))
     pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
     message: Image | None = None
@@ -63,11 +64,11 @@ async def run(bus: Bus, config: Config) -> None:
     while True:
         header = bus.header(frame)  # the instant of exposure: the latest state is rendered
         world = truth.latest or WorldObjects()
-        state = joints.latest
-        if state is not None and camera.is_at(state):
-            header = header.model_copy(update={"stamp": state.header.stamp})
-        view = (await asyncio.to_thread(camera.capture, world, state, header.stamp) if camera.takes_long(world)
-                else camera.capture(world, state, header.stamp))
+        states = [each.latest for each in joints]
+        if (carrier := states[0]) is not None and camera.is_at(carrier):
+            header = header.model_copy(update={"stamp": carrier.header.stamp})
+        view = (await asyncio.to_thread(camera.capture, world, states, header.stamp) if camera.takes_long(world)
+                else camera.capture(world, states, header.stamp))
         image = add_image_noise(view.colour, config.noise_std, config.brightness, rng)
         if message is None or image is not last_image:
             message, last_image = array_to_image(image, "bgr8", header), image

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 
 import numpy as np
 from pydantic import Field
@@ -44,31 +45,33 @@ async def run(bus: Bus, config: Config) -> None:
 
     Images of a camera on the robot carry the stamp of the joint state from which its pose was computed.
     """
-    truth, joints = bus.reader(topics.SCENE_OBJECTS), bus.of_arm(config.arms.first).reader(topics.JOINT_STATES)
+    truth, arms = bus.reader(topics.SCENE_OBJECTS), config.arms.including(config.robot)
+    joints = [bus.of_arm(arm).reader(topics.JOINT_STATES) for arm in arms]
     images, depths = bus.writer(topics.DEPTH_CAMERA_IMAGE), bus.writer(topics.DEPTH_CAMERA_DEPTH)
     points, infos = bus.writer(topics.DEPTH_CAMERA_POINTS), bus.writer(topics.DEPTH_CAMERA_INFO)
     frame = config.world.camera.frame
     rng = np.random.default_rng(config.run.seed)
     camera = await asyncio.to_thread(
-        lambda: SimulatedCamera(config.world, config.scenery, config.robot, config, rng, plain=False))
+        lambda: SimulatedCamera(config.world, config.scenery, list(arms.values()), config, rng, plain=False))
 
-    def measure(world: WorldObjects, state: JointState | None, now: int) -> View:
+    def measure(world: WorldObjects, states: Sequence[JointState | None], now: int) -> View:
         """Return color and measured depth."""
-        view = camera.capture(world, state, now)
+        view = camera.capture(world, states, now)
         return View(view.colour, simulate_depth(view.depth, camera.pinhole, config, rng))
 
     await bus.ready()
     await truth.next()
-    await joints.next()
+    for each in joints:
+        await each.next()
     infos.put(camera.info(bus.header(frame)))
     pace = LoopRate(bus, lambda: bus.clock.wall_rate(config.rate, config.max_rate))
     while True:
         header = bus.header(frame)  # the instant of exposure of image, depth and points
         world = truth.latest or WorldObjects()
-        state = joints.latest
-        if state is not None and camera.is_at(state):
-            header = header.model_copy(update={"stamp": state.header.stamp})
-        view = await asyncio.to_thread(measure, world, state, header.stamp)
+        states = [each.latest for each in joints]
+        if (carrier := states[0]) is not None and camera.is_at(carrier):
+            header = header.model_copy(update={"stamp": carrier.header.stamp})
+        view = await asyncio.to_thread(measure, world, states, header.stamp)
         depth = view.depth_within(config.nearest, config.farthest)
         depth = add_depth_noise(depth, rng, config.depth_noise_std, config.depth_dropout)
         depths.put(array_to_image(depth, "32FC1", header))  # first: a client with the image has its depth

@@ -147,6 +147,10 @@ class Arms(Section):
         """The service's own arm or the first one, which carries cameras that are not fixed; empty with one robot."""
         return self.own or next(iter(self.robots), "")
 
+    def including(self, robot: RobotConfig) -> dict[str, RobotConfig]:
+        """Return all robots by arm, beginning with that of `first`; in a cell with one robot it has an empty name."""
+        return {self.first: robot} | self.robots
+
 
 class Cups(Section):
     """The robots of a cell whose suction cups are driven by its I/O."""

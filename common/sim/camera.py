@@ -56,7 +56,7 @@ class SimulatedCamera:
     """
 
     def __init__(
-        self, around: Surroundings, scenery: Scenery, robot: RobotConfig, config: CameraParameters,
+        self, around: Surroundings, scenery: Scenery, robots: Sequence[RobotConfig], config: CameraParameters,
         rng: np.random.Generator, *, plain: bool, lens: Lens | None = None, arm: bool = False,
     ) -> None:
         """Create the renderer and the sensor.
@@ -64,36 +64,36 @@ class SimulatedCamera:
         Args:
             around: fixtures, containers and the camera.
             scenery: the simulator and the light.
-            robot: loaded only if it is visible or carries the camera.
+            robots: loaded only if they are visible, or the first one carries the camera.
             config: light, exposure and noise, which may change at any time.
             rng: noise source.
             plain: see `common.sim.interface.load_renderer`.
             lens: of the camera; default: no distortion.
-            arm: show the arm in plain images, too.
+            arm: show the arms in plain images, too.
 
         Raises:
             ConfigError, UnknownName: the cell names something that does not exist.
         """
         self._lens = lens or Lens(around.camera)
         self._scenery, self._config = scenery, config
-        self._robot: RobotModel | None = None
-        self._robot_config = robot
+        self._robots: list[RobotModel] = []
+        self._robot_configs = robots
         self._mounted = MountedCamera(displaced(self._lens.rendered, config.pose_error),
-                                      self._model() if around.camera.mount else None)
+                                      self._models()[0] if around.camera.mount else None)
         self._camera = around.camera
         self._light = self._current_light()
-        self._renderer = load_renderer(around, self._light, self._model, plain=plain, camera=self._mounted.at(),
+        self._renderer = load_renderer(around, self._light, self._models, plain=plain, camera=self._mounted.at(),
                                        arm=arm)
         self._sensor, self._motion = Sensor(config, rng), ObjectMotion(current=bool(around.conveyors))
         self.moves = self._mounted.moves
         self.needs_joints = self.moves or self._renderer.needs_arm
 
-    def _model(self) -> RobotModel:
-        if self._robot is None:
+    def _models(self) -> list[RobotModel]:
+        if not self._robots:
             from common.robot.model import RobotModel
 
-            self._robot = RobotModel.load(self._robot_config)
-        return self._robot
+            self._robots = [RobotModel.load(config) for config in self._robot_configs]
+        return self._robots
 
     def _current_light(self) -> Scenery:
         lights, ambient = self._config.lights, self._config.ambient
@@ -116,18 +116,18 @@ class SimulatedCamera:
     def is_at(self, joints: JointState | None) -> bool:
         """Whether the joint state determines the camera's pose: it is mounted, and no joint of the arm is missing."""
         return (self.moves and joints is not None
-                and self._model().order(joints.name, joints.position) is not None)
+                and self._models()[0].order(joints.name, joints.position) is not None)
 
     def takes_long(self, truth: WorldObjects) -> bool:
         """Whether `capture` may take long."""
         return self._config.sub_exposures > 1 or self._renderer.takes_long(truth.objects)
 
-    def capture(self, truth: WorldObjects, joints: JointState | None, now: int) -> View:
+    def capture(self, truth: WorldObjects, joints: Sequence[JointState | None], now: int) -> View:
         """Return the output image, and the noiseless depth at the end of the exposure.
 
         Args:
             truth: state of all objects.
-            joints: state of the arm.
+            joints: state of each arm.
             now: end of the exposure, a stamp [ns].
         """
         light = self._current_light()
@@ -137,12 +137,12 @@ class SimulatedCamera:
         self._motion.update(truth)
         views = []
         for ago in sample_times(self._sensor.exposure, self._config.sub_exposures):
-            state = joints_ago(joints, ago)
-            if self.moves and state is not None:
-                q = self._model().order(state.name, state.position)
+            states = [joints_ago(state, ago) for state in joints]
+            if self.moves and (state := states[0]) is not None:
+                q = self._models()[0].order(state.name, state.position)
                 if q is not None:
                     self._renderer.move_camera(self._mounted.at(q))
-            views.append(self._renderer.render(self._motion.objects(ago, now), state))
+            views.append(self._renderer.render(self._motion.objects(ago, now), *states))
         images = [self._lens.distort(view.colour) for view in views]
         image = self._lens.rectify(self._sensor.expose(images, self._renderer.level))
         return View(image, views[-1].depth)

@@ -10,7 +10,7 @@ where each of the `objects` has a position, and `tolerances` define when the fin
 cell time [s], passed as arguments. In the process of each camera, images are rendered from `scene_objects` and
 `joint_states` by the module's
 
-    def renderer(around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool,
+    def renderer(around: Surroundings, scenery: Scenery, robots: Callable[[], Sequence[RobotModel]], *, plain: bool,
                  camera: Pinhole, arm: bool) -> Renderer
 
 and as for `kinematic` if it has none.
@@ -210,7 +210,7 @@ class Renderer(Protocol):
 
     camera: Pinhole
     needs_arm: bool
-    """Whether the arm is visible, so that `render` needs the joint state."""
+    """Whether arms are visible, so that `render` needs their joint states."""
 
     @property
     def level(self) -> Array:
@@ -225,15 +225,15 @@ class Renderer(Protocol):
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
         """Whether rendering the objects may take long."""
 
-    def render(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
-        """Return the view of the objects, and of the arm if its joint state is complete.
+    def render(self, objects: Sequence[WorldObject], *joints: JointState | None) -> View:
+        """Return the view of the objects, and of each arm, in the order of creation, if its joint state is complete.
 
         Objects in state "elsewhere" are not shown. A view is never modified; an unchanged scene returns the same one.
         """
 
 
 def load_renderer(
-    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole,
+    around: Surroundings, scenery: Scenery, robots: Callable[[], Sequence[RobotModel]], *, plain: bool, camera: Pinhole,
     arm: bool = False,
 ) -> Renderer:
     """Create the renderer of the scenery's simulator for a camera.
@@ -241,10 +241,10 @@ def load_renderer(
     Args:
         around: fixtures and containers.
         scenery: the simulator and the light.
-        robot: returns the robot model; called only if the arm is visible.
+        robots: returns the models of all arms; called only if they are visible.
         plain: for a camera whose simplified images need neither arm nor depth.
         camera: intrinsics and pose.
-        arm: show the arm in plain images, too.
+        arm: show the arms in plain images, too.
 
     Raises:
         UnknownName: no such simulator; lists the choices.
@@ -253,7 +253,7 @@ def load_renderer(
     module = _module(scenery.simulator)
     if not hasattr(module, "renderer"):
         module = _module(KINEMATIC)
-    created: Renderer = module.renderer(around, scenery, robot, plain=plain, camera=camera, arm=arm)
+    created: Renderer = module.renderer(around, scenery, robots, plain=plain, camera=camera, arm=arm)
     return created
 
 

@@ -44,14 +44,14 @@ def create(
 
 
 def renderer(
-    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole,
+    around: Surroundings, scenery: Scenery, robots: Callable[[], Sequence[RobotModel]], *, plain: bool, camera: Pinhole,
     arm: bool = False,
 ) -> Renderer:
     """Create the renderer of this world for one camera: see `common.sim.interface`."""
     from common.sim.rendering import Renderer  # only cameras need it
 
-    seen = robot() if arm or not plain else None
-    return Renderer(around, seen, plain=plain, camera=camera, scenery=scenery)
+    seen = robots() if arm or not plain else ()
+    return Renderer(around, *seen, plain=plain, camera=camera, scenery=scenery)
 
 
 class KinematicWorld(WorldEvents):

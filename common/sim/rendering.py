@@ -50,14 +50,14 @@ class Renderer:
     """Renders one camera. Rays are cast only for what changed: static geometry once, the arm when it moves."""
 
     def __init__(
-        self, around: Surroundings, robot: RobotModel | None = None, *, plain: bool = False,
+        self, around: Surroundings, *robots: RobotModel, plain: bool = False,
         camera: Pinhole | None = None, rim_width: float = RIM_WIDTH, scenery: Scenery | None = None,
     ) -> None:
         """Render the background.
 
         Args:
             around: fixtures and containers, and the default camera.
-            robot: shown if given.
+            robots: shown if given.
             plain: render plain images.
             camera: intrinsics and pose of the optical frame.
             rim_width: of the white outline of each sphere in a plain image [px]; 0 for none.
@@ -67,15 +67,15 @@ class Renderer:
             ConfigError: a mesh of the robot is missing.
         """
         self.camera = camera if camera is not None else Pinhole.from_config(around.camera)
-        self.needs_arm = robot is not None
+        self.needs_arm = bool(robots)
         self.set_light(scenery or Scenery())
-        self._plain, self._rim_width, self._robot, self._around = plain, rim_width, robot, around
-        self._shapes = _shapes_of(robot) if robot is not None else {}
+        self._plain, self._rim_width, self._around = plain, rim_width, around
+        self._robots = [(robot, _shapes_of(robot)) for robot in robots]
         self._meshes: dict[tuple[object, ...], Array] = {}  # triangles of visible objects, in their own frames
         self._static_meshes = [] if plain else _static_meshes(around)
         self._last_request: Sequence[WorldObject] | None = None
         self._objects: list[WorldObject] | None = None
-        self._joints: Array | None = None
+        self._joints: Array = np.empty(0)
         # Of the last plain image, by center and radius.
         self._spheres: dict[tuple[float, ...], SphereCoverage | None] = {}
         self._draw_background()
@@ -89,7 +89,7 @@ class Renderer:
         if camera.T_world_optical is self.camera.T_world_optical or np.allclose(
                 camera.T_world_optical, self.camera.T_world_optical, rtol=0, atol=STILL_POSE):
             return
-        self.camera, self._last_request, self._objects, self._joints, self._spheres = camera, None, None, None, {}
+        self.camera, self._last_request, self._objects, self._spheres = camera, None, None, {}
         self._draw_background()
 
     def _draw_background(self) -> None:
@@ -100,24 +100,24 @@ class Renderer:
     def takes_long(self, objects: Sequence[WorldObject]) -> bool:
         """Whether rendering the objects may take long: everything but a few spheres is ray-cast."""
         slow = len(objects) > FEW or any(obj.shape != "sphere" for obj in objects)
-        return bool(self._shapes) or (slow and objects != self._last_request)
+        return self.needs_arm or (slow and objects != self._last_request)
 
-    def render(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
-        """Return the view of the objects, and of the arm if its joint state is complete.
+    def render(self, objects: Sequence[WorldObject], *joints: JointState | None) -> View:
+        """Return the view of the objects, and of each arm if its joint state is complete.
 
         The depth of a plain image contains neither table nor spheres. Objects in state "elsewhere" are not shown.
         """
         self._last_request = objects
-        occluded = ("held", "elsewhere") if self._plain and not self._shapes else ("elsewhere",)
+        occluded = ("held", "elsewhere") if self._plain and not self.needs_arm else ("elsewhere",)
         visible = [obj for obj in objects if obj.state not in occluded]
         changed = self._objects is None or visible != self._objects
         if changed:
             self._objects = visible
             self._static_view = self._with_objects(visible, [])
-        positions = None if joints is None else np.array(joints.position)
-        if changed or not _same(positions, self._joints):
+        positions = all_positions(joints)
+        if changed or not same_positions(positions, self._joints):
             self._joints = positions
-            arm = self._arm(joints)
+            arm = self._arms(joints)
             if arm and self._plain:  # spheres are drawn last
                 self._view = self._with_objects(visible, arm)
             else:
@@ -167,13 +167,12 @@ class Renderer:
         color = (obj.color.r, obj.color.g, obj.color.b)
         return Mesh(transformed(self._meshes[appearance], pose_to_matrix(obj.pose)), color)
 
-    def _arm(self, joints: JointState | None) -> list[Mesh]:
-        if joints is None or self._robot is None or not self._shapes:
-            return []
-        poses = link_poses(self._robot, joints)
-        if poses is None:
-            return []
-        return [Mesh(transformed(corners, poses[link]), ARM) for link, corners in self._shapes.items()]
+    def _arms(self, joints: Sequence[JointState | None]) -> list[Mesh]:
+        return [
+            Mesh(transformed(corners, poses[link]), ARM)
+            for (robot, shapes), state in zip(self._robots, joints, strict=False)
+            if (poses := link_poses(robot, state)) is not None for link, corners in shapes.items()
+        ]
 
 
 def _shapes_of(robot: RobotModel) -> dict[str, Array]:
@@ -182,10 +181,10 @@ def _shapes_of(robot: RobotModel) -> dict[str, Array]:
     return robot_shapes(robot)
 
 
-def link_poses(robot: RobotModel, joints: JointState) -> Mapping[str, Array] | None:
+def link_poses(robot: RobotModel, joints: JointState | None) -> Mapping[str, Array] | None:
     """(4, 4) pose of each link in world, fingers included; None if the state lacks a joint of the arm."""
-    q = robot.order(joints.name, joints.position)
-    if q is None:
+    q = robot.order(joints.name, joints.position) if joints is not None else None
+    if q is None or joints is None:
         return None
     others = {name: value for name, value in zip(joints.name, joints.position, strict=True)
               if name in robot.config.locked_joints}
@@ -318,7 +317,11 @@ def _bgr(obj: WorldObject) -> tuple[int, int, int]:
     return b, g, r
 
 
-def _same(a: Array | None, b: Array | None) -> bool:
-    if a is None or b is None:
-        return a is b
+def all_positions(joints: Sequence[JointState | None]) -> Array:
+    """Positions of the joints of all arms, for `same_positions`."""
+    return np.array([position for state in joints if state is not None for position in state.position])
+
+
+def same_positions(a: Array, b: Array) -> bool:
+    """Whether no joint has moved visibly."""
     return a.shape == b.shape and bool(np.all(np.abs(a - b) < STILL))

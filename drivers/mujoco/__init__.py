@@ -37,15 +37,15 @@ def create(
 
 
 def renderer(
-    around: Surroundings, scenery: Scenery, robot: Callable[[], RobotModel], *, plain: bool, camera: Pinhole,
+    around: Surroundings, scenery: Scenery, robots: Callable[[], Sequence[RobotModel]], *, plain: bool, camera: Pinhole,
     arm: bool = False,
 ) -> Renderer:
-    """Create the renderer of this world for one camera, always with the arm. A plain image has no depth."""
+    """Create the renderer of this world for one camera, always with the arms. A plain image has no depth."""
     require()
     from drivers.mujoco.gl import select_gl
     from drivers.mujoco.rendering import PhysicsRenderer
 
-    return PhysicsRenderer(around, scenery, robot(), camera, depth=not plain, gl=select_gl())
+    return PhysicsRenderer(around, scenery, robots(), camera, depth=not plain, gl=select_gl())
 
 
 def require() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import mujoco
 import numpy as np
@@ -14,7 +14,7 @@ from common.hardware.mock import SimulatedFingers
 from common.robot.finger_joints import driven_position, finger_positions, width_at
 from common.robot.model import RobotModel
 from drivers.mujoco.cup import PhysicsCup, Seal
-from drivers.mujoco.model import FORCE_SENSOR, CellModel
+from drivers.mujoco.model import FORCE_SENSOR, CellModel, prefix
 from drivers.mujoco.robot import FINGER_ARMATURE
 
 ENCODER = 6  # decimals of measured [rad], [rad/s]
@@ -22,19 +22,21 @@ MAX_AGE = 0.1  # [s] to which a set-point is extrapolated
 
 
 class PhysicsArm:
-    """An arm moved by servos: reading it advances the world."""
+    """An arm moved by servos: reading it, or another one of its world, advances the world."""
 
-    def __init__(self, robot: RobotModel, start: Vector, advance: Callable[[float], None], seal: Seal) -> None:
+    def __init__(
+        self, name: str, robot: RobotModel, start: Vector, advance: Callable[[float], None], seal: Seal
+    ) -> None:
         """Start at rest at `start` (dof,) [rad]; `advance` advances the world to a time [s]; `seal` is of a cup."""
-        config = robot.config.gripper
-        self.fingers = PhysicsFingers(config) if config is not None and config.joints else None
-        self.cup = PhysicsCup(config, seal) if config is not None and config.cup is not None else None
+        config, self._prefix = robot.config.gripper, prefix(name)
+        self.fingers = PhysicsFingers(config, self._prefix) if config is not None and config.joints else None
+        self.cup = PhysicsCup(config, seal, self._prefix) if config is not None and config.cup is not None else None
         self._tool = self.fingers or self.cup
         self.gripper: Gripper | None = self._tool
         self.known_payload = None  # the sensor measures all that is beyond the flange
-        self._wrench: Vector | None = None
-        self._wrenches: list[Vector] = []  # of the steps since the last reading of the joints
-        self._names = robot.joint_names
+        self._wrenches: list[Vector] = []  # of the steps before the last reading of the joints
+        self._newer: list[Vector] = []  # of those since
+        self._names = [self._prefix + name for name in robot.joint_names]
         self._advance = advance
         self._q, self._dq, self._written = start.copy(), np.zeros(len(start)), -np.inf
 
@@ -44,15 +46,16 @@ class PhysicsArm:
         self._qpos = [cell.joints[name] for name in self._names]
         self._dofs = [cell.dofs[name] for name in self._names]
         self._actuators = [cell.actuators[name] for name in self._names]
-        self._sensor = np.concatenate([range(at := int(cell.model.sensor(name).adr[0]), at + 3)
+        self._sensor = np.concatenate([range(at := int(cell.model.sensor(self._prefix + name).adr[0]), at + 3)
                                        for name in FORCE_SENSOR])
         if self._tool is not None:
             self._tool.attach(cell, data)
 
     def read(self, now: float) -> tuple[Vector, Vector]:
         """Return measured positions (dof,) [rad] and velocities (dof,) [rad/s]; time must not decrease."""
-        self._wrenches.clear()
         self._advance(now)
+        if self._newer:
+            self._wrenches, self._newer = self._newer, []
         q, dq = self._data.qpos[self._qpos], self._data.qvel[self._dofs]
         return np.round(q, ENCODER) + 0.0, np.round(dq, ENCODER) + 0.0  # no negative zeros: readings at rest are equal
 
@@ -73,7 +76,7 @@ class PhysicsArm:
 
     def measure(self) -> None:
         """Read the force sensor after a step. MuJoCo's is what the arm exerts on the flange: of the other sign."""
-        self._wrenches.append(-self._data.sensordata[self._sensor])
+        self._newer.append(-self._data.sensordata[self._sensor])
 
     def wrench(self) -> Vector | None:
         """Return the mean (6,) over the steps of the last reading; before the first step None.
@@ -83,9 +86,7 @@ class PhysicsArm:
         """
         if self.cup is not None and self.cup.pulls:
             raise HardwareFault("MuJoCo measures no force at a cup that pulls")
-        if self._wrenches:
-            self._wrench = np.mean(self._wrenches, axis=0)
-        return self._wrench
+        return np.asarray(np.mean(self._wrenches, axis=0)) if self._wrenches else None
 
     def sense(self, now: float) -> None:
         """Update the state of fingers or cup after steps."""
@@ -110,21 +111,28 @@ FINGER_LEAD = FINGER_DAMPING / FINGER_STIFFNESS  # [s]
 _STEP = 1e-4
 
 
-def tune(cell: CellModel, robot: RobotModel) -> None:
+def tune(cell: CellModel, robots: Mapping[str, RobotModel]) -> None:
     """Write servo gains and force limits into the model; limits are the URDF's efforts, if any."""
     model, data = cell.model, mujoco.MjData(cell.model)
     data.qpos[:] = cell.start
     mujoco.mj_forward(model, data)
     inertia = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
-    for index, name in enumerate(robot.joint_names):
+    for arm, robot in robots.items():
+        _tune_arm(cell, robot, prefix(arm), inertia)
+
+
+def _tune_arm(cell: CellModel, robot: RobotModel, before: str, inertia: Vector) -> None:
+    model = cell.model
+    for index, joint in enumerate(robot.joint_names):
+        name = before + joint
         inertia_here = float(inertia[cell.dofs[name], cell.dofs[name]])
         effort = float(robot.model.effortLimit[index])
         _set(model, cell.actuators[name], inertia_here * FREQUENCY**2, 2 * inertia_here * FREQUENCY,
              effort if 0 < effort < math.inf else math.inf)
     gripper = robot.config.gripper
     if gripper is not None and gripper.joints:
-        name = gripper.joints[0]
+        name = before + gripper.joints[0]
         slope = width_slope(gripper, gripper.max_width / 2)
         model.dof_armature[cell.dofs[name]] = FINGER_ARMATURE * slope**2
         _set(model, cell.actuators[name], FINGER_STIFFNESS * slope**2, FINGER_DAMPING * slope**2,
@@ -163,9 +171,9 @@ SLIPS = 0.03  # [s] of motion: they no longer press
 class PhysicsFingers:
     """The gripper of the physics world. Joint and servo determine whether it holds something."""
 
-    def __init__(self, config: GripperConfig) -> None:
-        """Start open, with full force."""
-        self._config = config
+    def __init__(self, config: GripperConfig, before: str) -> None:
+        """Start open, with full force; names of its joints in the model have `before` in front."""
+        self._config, self._joints = config, [before + joint for joint in config.joints]
         self._profile = SimulatedFingers(config, config.max_width)  # motion without an object between them
         self._target, self._effort = config.max_width, config.max_effort
         self._placed = False  # they press since before a restart
@@ -177,7 +185,7 @@ class PhysicsFingers:
 
     def attach(self, cell: CellModel, data: mujoco.MjData) -> None:
         """Drive the fingers of this model."""
-        name = self._config.joints[0]
+        name = self._joints[0]
         self._cell, self._data = cell, data
         self._slope = width_slope(self._config, float(data.qpos[cell.joints[name]]))
         self._qpos, self._dof, self._actuator = cell.joints[name], cell.dofs[name], cell.actuators[name]
@@ -202,7 +210,7 @@ class PhysicsFingers:
         width = min(max(width, 0.0), self._config.max_width)
         self._profile.place(width)
         self._target, self._width, self._rate, self._placed = width, width, 0.0, True
-        for joint, position in zip(self._config.joints, finger_positions(self._config, width), strict=True):
+        for joint, position in zip(self._joints, finger_positions(self._config, width), strict=True):
             self._data.qpos[self._cell.joints[joint]] = position
             self._data.qvel[self._cell.dofs[joint]] = 0.0
         mujoco.mj_forward(self._cell.model, self._data)

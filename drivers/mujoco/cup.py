@@ -23,16 +23,16 @@ class PhysicsCup:
         held: id of the held object, or empty.
     """
 
-    def __init__(self, config: GripperConfig, seal: Seal) -> None:
-        """Start with a closed valve; `seal` finds the object that the lip is on."""
+    def __init__(self, config: GripperConfig, seal: Seal, before: str) -> None:
+        """Start with a closed valve; `seal` finds the object that the lip is on; its actuator is `before` + LIP."""
         assert config.cup is not None
         self._config, self._force, self._seal = config, config.cup.force, seal
-        self._valve = SimulatedFingers(config)
+        self._valve, self._actuator_name = SimulatedFingers(config), before + LIP
         self._sealed, self.held = "", ""
 
     def attach(self, cell: CellModel, data: mujoco.MjData) -> None:
         """Pull with the actuator of this model."""
-        self._data, self._actuator = data, cell.actuators[LIP]
+        self._data, self._actuator = data, cell.actuators[self._actuator_name]
 
     def command(self, width: float, now: float, effort: float) -> None:
         """Open the valve at width 0, close it at the largest; the vacuum determines the force."""

@@ -1,13 +1,14 @@
 """MuJoCo model of a cell from its configuration, for dynamics and for rendering; object states from physics.
 
-    cell = build_model(RobotModel.load(config.robot), config.world, objects)
+    cell = build_model({"": RobotModel.load(config.robot)}, config.world, objects)
     data = mujoco.MjData(cell.model)
     cell.set_joints(data, joint_names, positions)
     cell.set_object(data, "cup", T_world_cup)
     mujoco.mj_forward(cell.model, data)
 
-Frames are the project's: link bodies have their URDF names and frames, world is world. Geoms of group `scene.SEEN` are
-only visual, those of `scene.COLLIDES` only collide, all others are both. Objects, floor, fixtures and containers have
+Frames are the project's: link bodies have their URDF names and frames, world is world. With several arms, names of
+links, joints and servos begin with that of the arm: `left/panda_link0`. Geoms of group `scene.SEEN` are only
+visual, those of `scene.COLLIDES` only collide, all others are both. Objects, floor, fixtures and containers have
 their configured colors; the model has no lights.
 """
 
@@ -39,6 +40,7 @@ from drivers.mujoco.scene import (
     add_lip,
     add_object,
     add_surroundings,
+    arm_category,
 )
 
 Array = NDArray[np.float64]
@@ -60,10 +62,10 @@ class CellModel:
 
     Attributes:
         spec: source; may be modified (lights, materials) and recompiled with `compiled`.
-        joints, dofs: index into qpos and qvel of each joint of the robot, by name.
+        joints, dofs: index into qpos and qvel of each joint of the arms, by name.
         actuators: index of the servo of each driven joint, by joint name.
         things: addresses of objects by id.
-        start: qpos with the arm at home and open fingers; objects are far away and apart.
+        start: qpos with the arms at home and open fingers; objects are far away and apart.
     """
 
     spec: mujoco.MjSpec
@@ -92,13 +94,18 @@ class CellModel:
         return transform(quaternion_to_matrix(qx, qy, qz, qw), (x, y, z))
 
 
+def prefix(arm: str) -> str:
+    """Return what names in the model begin with that belong to an arm; empty for the only one."""
+    return f"{arm}/" if arm else ""
+
+
 def build_model(
-    robot: RobotModel, world: Surroundings, objects: Sequence[SceneObject], *, visuals: bool = False
+    robots: Mapping[str, RobotModel], world: Surroundings, objects: Sequence[SceneObject], *, visuals: bool = False
 ) -> CellModel:
-    """Build the cell: robot, surroundings, objects and cameras.
+    """Build the cell: robots, surroundings, objects and cameras.
 
     Args:
-        robot: any that the planner supports.
+        robots: any that the planner supports, by arm; the name of the only one is empty. The first carries cameras.
         world: surroundings and cameras.
         things: each becomes a free body.
         visuals: include visual meshes, needed only for rendering.
@@ -106,32 +113,47 @@ def build_model(
     Raises:
         ConfigError: a part cannot be simulated.
     """
-    spec = mujoco.MjSpec()
-    spec.modelname = robot.config.name
+    spec = _new_spec()
+    (first, carrier), *_ = robots.items()
+    spec.modelname = carrier.config.name
     option = spec.option
     option.timestep, option.impratio = TIMESTEP, IMPRATIO
     option.noslip_iterations = world.slip_iterations if isinstance(world, World) else 0
     option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.balanceinertia = 1e-4, 1e-7, True
-    spec.compiler.degree = False
     add_surroundings(spec, world)
-    add_robot(spec, robot, visuals)
-    add_cameras(spec, world, robot)
+    for number, (arm, robot) in enumerate(robots.items()):
+        part = _new_spec() if arm else spec
+        _add_arm(part, robot, arm_category(number), visuals)
+        if arm:
+            spec.attach(part, prefix=prefix(arm), frame=spec.worldbody.add_frame())
+    add_cameras(spec, world, carrier, prefix(first))
     for obj in objects:
         add_object(spec, obj)
+    cell = compiled(spec, robots, [obj.id for obj in objects])
+    if excluded := _contacts_at_home(cell):
+        for pair in excluded:
+            spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
+        cell = compiled(spec, robots, [obj.id for obj in objects])
+    return cell
+
+
+def _new_spec() -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.compiler.boundmass, spec.compiler.boundinertia, spec.compiler.balanceinertia = 1e-4, 1e-7, True
+    spec.compiler.degree = False
+    return spec
+
+
+def _add_arm(spec: mujoco.MjSpec, robot: RobotModel, category: int, visuals: bool) -> None:
+    """Add an arm with its gripper, servos and force sensor, in a collision category."""
     gripper = robot.config.gripper
+    add_robot(spec, robot, visuals, category)
     if gripper is not None and gripper.cup is not None:
-        add_lip(spec, robot.config.tcp_link, gripper.cup)
+        add_lip(spec, robot.config.tcp_link, gripper.cup, category)
     for name in [*robot.joint_names, *(gripper.joints[:1] if gripper else [])]:
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=1.0, kv=1.0)  # gains: `arm.tune`
     _add_force_sensor(spec, robot)
-    cell = compiled(spec, robot, [obj.id for obj in objects])
-    if excluded := _contacts_at_home(cell):
-        for pair in excluded:
-            spec.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
-        cell = compiled(spec, robot, [obj.id for obj in objects])
-    return cell
 
 
 FORCE_SENSOR = "flange force", "flange torque"
@@ -144,7 +166,7 @@ def _add_force_sensor(spec: mujoco.MjSpec, robot: RobotModel) -> None:
         spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site.name)
 
 
-def compiled(spec: mujoco.MjSpec, robot: RobotModel, objects: Iterable[str]) -> CellModel:
+def compiled(spec: mujoco.MjSpec, robots: Mapping[str, RobotModel], objects: Iterable[str]) -> CellModel:
     """Compile a spec of `build_model`.
 
     Raises:
@@ -165,20 +187,21 @@ def compiled(spec: mujoco.MjSpec, robot: RobotModel, objects: Iterable[str]) -> 
         joint, body = model.joint(f"object:{obj}"), model.body(f"object:{obj}")
         addresses[obj] = Address(int(body.id), int(joint.qposadr[0]), int(joint.dofadr[0]))
     actuators = {model.actuator(number).name: number for number in range(model.nu)}
-    return CellModel(spec, model, joints, dofs, actuators, addresses, _start(model, robot, joints, addresses))
+    return CellModel(spec, model, joints, dofs, actuators, addresses, _start(model, robots, joints, addresses))
 
 
 def _start(
-    model: mujoco.MjModel, robot: RobotModel, joints: Mapping[str, int], addresses: Mapping[str, Address]
+    model: mujoco.MjModel, robots: Mapping[str, RobotModel], joints: Mapping[str, int], addresses: Mapping[str, Address]
 ) -> Array:
     start = np.array(model.qpos0)
     for number, address in enumerate(addresses.values()):  # else they would overlap
         start[address.qpos: address.qpos + 3] = 0.0, 0.0, (1 + number) * AWAY
-    for name, position in robot.config.locked_joints.items():
-        if name in joints:
-            start[joints[name]] = position
-    for name, position in zip(robot.joint_names, robot.named("home"), strict=True):
-        start[joints[name]] = position
+    for arm, robot in robots.items():
+        for name, position in robot.config.locked_joints.items():
+            if prefix(arm) + name in joints:
+                start[joints[prefix(arm) + name]] = position
+        for name, position in zip(robot.joint_names, robot.named("home"), strict=True):
+            start[joints[prefix(arm) + name]] = position
     return start
 
 
@@ -189,8 +212,8 @@ def _contacts_at_home(cell: CellModel) -> list[tuple[str, str]]:
     mujoco.mj_forward(model, data)
     pairs = set()
     for contact in data.contact:
-        first, second = sorted(contact.geom, key=lambda geom: int(model.geom_contype[geom]))
-        if (model.geom_contype[first], model.geom_contype[second]) == (ROBOT, FIXED):
+        first, second = sorted(contact.geom, key=lambda geom: bool(model.geom_contype[geom] == FIXED))
+        if model.geom_contype[first] & ROBOT and model.geom_contype[second] == FIXED:
             pairs.add((model.body(model.geom_bodyid[first]).name, model.body(model.geom_bodyid[second]).name))
     return sorted(pairs)
 
@@ -205,20 +228,21 @@ REST_SPEED = 0.02  # [m/s] of an object at rest
 class Contacts:
     """Contacts of objects: with fingers, with the floor, and any."""
 
-    def __init__(self, cell: CellModel, robot: RobotModel) -> None:
-        """Start without contacts."""
+    def __init__(self, cell: CellModel, robots: Mapping[str, RobotModel]) -> None:
+        """Start without contacts. A suction cup has no fingers."""
         model = cell.model
         self._names = list(cell.objects)
         number = {cell.objects[name].body: index for index, name in enumerate(self._names)}
         self._object = np.array([number.get(int(body), -1) for body in model.geom_bodyid])
-        config = robot.config.gripper
-        fingers = [model.body(link).id for link in (config.links if config is not None else [])]
-        side = {body: index for index, body in enumerate(fingers)}
+        fingers = [(number, model.body(prefix(arm) + link).id) for number, (arm, robot) in enumerate(robots.items())
+                   if (gripper := robot.config.gripper) is not None and gripper.cup is None for link in gripper.links]
+        side = {body: index for index, (_, body) in enumerate(fingers)}
+        self._arm = np.array([number for number, _ in fingers], int)
         self._side = np.array([side.get(int(body), -1) for body in model.geom_bodyid])
         self._floor = model.geom("floor").id
 
     def update(self, data: mujoco.MjData) -> tuple[set[str], set[str], set[str]]:
-        """Names of objects touched by two gripper links, on the floor, and touching anything."""
+        """Names of objects touched by two links of one gripper, on the floor, and touching anything."""
         pairs = data.contact.geom
         if not len(pairs):
             return set(), set(), set()
@@ -227,8 +251,9 @@ class Contacts:
         objects, others = self._object[pairs[:, 0]], pairs[:, 1]
         sides = self._side[others]
         fingers = np.unique(np.stack([objects[sides >= 0], sides[sides >= 0]]), axis=1)
-        names = self._names
-        held = {names[index] for index in range(len(names)) if (fingers[0] == index).sum() >= 2}
+        names, (found, count) = self._names, np.unique(
+            np.stack([fingers[0], self._arm[fingers[1]]]), axis=1, return_counts=True)
+        held = {names[index] for index in found[0][count >= 2]}
         return held, {names[index] for index in objects[others == self._floor]}, {names[index] for index in objects}
 
 

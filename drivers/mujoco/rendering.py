@@ -1,4 +1,4 @@
-"""Render the physics world with light, shadow and the arm: by OpenGL, or by ray casting without it.
+"""Render the physics world with light, shadow and the arms: by OpenGL, or by ray casting without it.
 
 Pixel values are proportional to light and use their full range: `level` is the light of the value 255, and a sensor
 (`common/sim/sensors.py`) applies the exposure.
@@ -25,7 +25,7 @@ from common.robot.model import RobotModel
 from common.robot.transforms import matrix_to_quaternion, pose_to_matrix
 from common.sim.objects import Solid, appearance_of, solid_of_message
 from common.sim.ray_caster import View
-from common.sim.rendering import STILL, STILL_POSE, link_poses
+from common.sim.rendering import STILL_POSE, all_positions, link_poses, same_positions
 from common.sim.sensors import CUTOFF, ambient, lamps, tint, white_level
 from common.sim.table import tables
 from drivers.mujoco.gl import FAR, Canvas, SingleThread
@@ -44,7 +44,7 @@ class PhysicsRenderer:
     needs_arm = True
 
     def __init__(
-        self, around: Surroundings, scenery: Scenery, robot: RobotModel, camera: Pinhole, *, depth: bool,
+        self, around: Surroundings, scenery: Scenery, robots: Sequence[RobotModel], camera: Pinhole, *, depth: bool,
         gl: str,
     ) -> None:
         """Prepare; nothing is rendered yet.
@@ -52,7 +52,7 @@ class PhysicsRenderer:
         Args:
             around: fixtures and containers.
             scenery: the light.
-            robot: its visual meshes are shown.
+            robots: their visual meshes are shown.
             camera: intrinsics and pose.
             depth: compute depth; otherwise it is inf.
             gl: `egl`, `osmesa`, or empty for ray casting: see `gl.select_gl`.
@@ -61,14 +61,14 @@ class PhysicsRenderer:
             ConfigError: a mesh of the robot is missing.
         """
         self.camera = camera
-        self._around, self._robot, self._depth = around, robot, depth
+        self._around, self._robots, self._depth = around, robots, depth
         self._gl = gl
         self._thread = SingleThread("renderer")
         self._canvas: Canvas | None = None
         self._drawn: DrawnModel | None = None
         self._view: View | None = None
         self._objects: list[WorldObject] = []
-        self._joints: Array | None = None
+        self._joints: Array = np.empty(0)
         self.set_light(scenery)
 
     def set_light(self, scenery: Scenery) -> None:
@@ -86,24 +86,24 @@ class PhysicsRenderer:
         """Always True: rendering may take long."""
         return True
 
-    def render(self, objects: Sequence[WorldObject], joints: JointState | None = None) -> View:
-        """Return the view of the objects and of the arm in that state; objects in state "elsewhere" are not shown."""
+    def render(self, objects: Sequence[WorldObject], *joints: JointState | None) -> View:
+        """Return the view of the objects, not of those "elsewhere", and of the arms in these states."""
         visible = [obj for obj in objects if obj.state != "elsewhere"]
-        positions = None if joints is None else np.array(joints.position)
-        if self._view is not None and visible == self._objects and _same(positions, self._joints):
+        positions = all_positions(joints)
+        if self._view is not None and visible == self._objects and same_positions(positions, self._joints):
             return self._view
         self._objects, self._joints = visible, positions
         self._view = self._thread(self._draw, visible, joints)
         return self._view
 
-    def _draw(self, objects: list[WorldObject], joints: JointState | None) -> View:
+    def _draw(self, objects: list[WorldObject], joints: Sequence[JointState | None]) -> View:
         appearances = tuple(appearance_of(obj) for obj in objects)
         if self._drawn is None or self._drawn.appearances != appearances:
-            self._drawn = DrawnModel(self._around, self._robot, objects, self.camera)
+            self._drawn = DrawnModel(self._around, self._robots, objects, self.camera)
             if self._canvas is not None:
                 self._canvas.close()
             self._canvas = self._new_canvas(self._drawn.model)
-        self._drawn.put(objects, None if joints is None else link_poses(self._robot, joints))
+        self._drawn.put(objects, [link_poses(*each) for each in zip(self._robots, joints, strict=False)])
         if self._canvas is None:
             return ray_view(self._drawn.model, self._drawn.data, self.camera, self._scenery, self.level, FAR)
         return self._canvas.draw(self._drawn.data, self.camera, self._scenery, self.level, depth=self._depth)
@@ -164,13 +164,7 @@ def ray_view(
     return View(np.rint(colour).astype(np.uint8).reshape(*shape, 3), depth.astype(np.float32).reshape(shape))
 
 
-def _same(a: Array | None, b: Array | None) -> bool:
-    if a is None or b is None:
-        return a is b
-    return a.shape == b.shape and bool(np.all(np.abs(a - b) < STILL))
-
-
-TRIANGLES = 25_000  # of the robot
+TRIANGLES = 25_000  # of each robot
 AWAY = (0.0, 0.0, -100.0)  # [m] of links before the first joint state
 SHADOW_MAP = 1024  # [px] side; MuJoCo's default 4096 takes three times as long as the image
 SHADOW_REACH = 1.2  # [m] half side of the shadowed square around the aim of parallel light
@@ -179,14 +173,14 @@ SIDES = 48  # of round shapes
 
 
 class DrawnModel:
-    """Compiled model of fixtures, robot and objects, whose bodies can be moved.
+    """Compiled model of fixtures, robots and objects, whose bodies can be moved.
 
     Attributes:
         model, data: MuJoCo's; current after `put`.
     """
 
     def __init__(
-        self, around: Surroundings, robot: RobotModel | None, objects: Sequence[WorldObject], camera: Pinhole
+        self, around: Surroundings, robots: Sequence[RobotModel], objects: Sequence[WorldObject], camera: Pinhole
     ) -> None:
         """Build the model for images of the camera's size.
 
@@ -197,9 +191,7 @@ class DrawnModel:
         _set_quality(spec, camera)
         add_surroundings(spec, around)
         _cast_no_shadow(spec, around)
-        self._links: list[str] = []
-        if robot is not None:
-            self._add_robot(spec, robot)
+        self._links = [self._add_robot(spec, number, robot) for number, robot in enumerate(robots)]
         self.appearances = tuple(appearance_of(obj) for obj in objects)
         for number, obj in enumerate(objects):
             _add_object(spec, number, obj)
@@ -211,18 +203,19 @@ class DrawnModel:
                     for number in range(self.model.nbody) if self.model.body_mocapid[number] >= 0}
         mujoco.mj_forward(self.model, self.data)
 
-    def put(self, objects: Sequence[WorldObject], links: Mapping[str, Array] | None) -> None:
+    def put(self, objects: Sequence[WorldObject], links: Sequence[Mapping[str, Array] | None]) -> None:
         """Move the objects, in the order of construction, and the links.
 
         Args:
             objects: of the same appearance.
-            links: (4, 4) poses in world by name; None leaves the arm unchanged.
+            links: of each robot, (4, 4) poses in world by name; None leaves it unchanged.
         """
         for number, obj in enumerate(objects):
             self._set(f"object:{number}", pose_to_matrix(obj.pose))
-        if links is not None:
-            for name in self._links:
-                self._set(f"link:{name}", links[name])
+        for robot, (names, poses) in enumerate(zip(self._links, links, strict=False)):
+            for name in names:
+                if poses is not None:
+                    self._set(f"link:{robot}:{name}", poses[name])
         mujoco.mj_kinematics(self.model, self.data)
 
     def _set(self, body: str, T: Array) -> None:
@@ -230,17 +223,20 @@ class DrawnModel:
         self.data.mocap_pos[self._at[body]] = T[:3, 3]
         self.data.mocap_quat[self._at[body]] = (w, x, y, z)
 
-    def _add_robot(self, spec: mujoco.MjSpec, robot: RobotModel) -> None:
+    def _add_robot(self, spec: mujoco.MjSpec, at: int, robot: RobotModel) -> list[str]:
+        """Add a robot by its number; return the links that are visible."""
+        links: list[str] = []
         for number, piece in enumerate(cached_visual_meshes(robot, TRIANGLES)):
-            body = spec.body(f"link:{piece.link}")
+            body = spec.body(f"link:{at}:{piece.link}")
             if body is None:
-                body = spec.worldbody.add_body(name=f"link:{piece.link}", mocap=True, pos=AWAY)
-                self._links.append(piece.link)
-            mesh = spec.add_mesh(name=f"seen:{number}")
+                body = spec.worldbody.add_body(name=f"link:{at}:{piece.link}", mocap=True, pos=AWAY)
+                links.append(piece.link)
+            mesh = spec.add_mesh(name=f"seen:{at}:{number}")
             mesh.uservert, mesh.userface = piece.vertices.ravel(), piece.faces.ravel()
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name,
                           rgba=[*(part / 255 for part in piece.color), 1.0])
+        return links
 
 
 def _set_quality(spec: mujoco.MjSpec, camera: Pinhole) -> None:

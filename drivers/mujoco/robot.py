@@ -20,7 +20,7 @@ from common.robot.link_shapes import Shape, link_shapes, pose_of_origin
 from common.robot.mesh_files import content_of, triangles_of
 from common.robot.model import RobotModel
 from common.robot.urdf import WORLD, find_description
-from drivers.mujoco.scene import COLLIDES, ROBOT, SOLIMP, SOLREF, set_contact, set_finger_contact, visual_only, wxyz
+from drivers.mujoco.scene import COLLIDES, SOLIMP, SOLREF, set_contact, set_finger_contact, visual_only, wxyz
 
 if TYPE_CHECKING:
     from common.robot.visual_meshes import Piece
@@ -73,8 +73,8 @@ _JOINTS = {"revolute": _HINGE, "continuous": _HINGE, "prismatic": _SLIDE}
 _TRIANGLES = 25_000  # of all visual meshes of a robot
 
 
-def add_robot(spec: mujoco.MjSpec, robot: RobotModel, visuals: bool) -> None:
-    """Add the robot with its base at the configured pose; one body per link, of its name.
+def add_robot(spec: mujoco.MjSpec, robot: RobotModel, visuals: bool, category: int) -> None:
+    """Add the robot with its base at the configured pose; one body per link, of its name, in a collision category.
 
     Raises:
         ConfigError: a URDF joint or shape is not supported, or a mesh cannot be read.
@@ -100,7 +100,7 @@ def add_robot(spec: mujoco.MjSpec, robot: RobotModel, visuals: bool) -> None:
         _add_inertia(body, links[name])
         for index, shape in enumerate(shapes[name]):
             geom = _add_shape(spec, body, shape, f"{name}.{index}", robot)
-            set_contact(geom, ROBOT, group=COLLIDES).density = DENSITY
+            set_contact(geom, category, group=COLLIDES).density = DENSITY
             if name in grippers:
                 set_finger_contact(geom)
         for index, piece in enumerate(seen[name]):

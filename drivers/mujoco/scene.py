@@ -110,8 +110,15 @@ FINGER_SLIDING = 1.5  # rubber pads
 CONDIM = 6  # sliding, torsion and rolling
 FINGER_PRIORITY, OBJECT_PRIORITY = 1, 2  # the friction of the geom of higher priority applies; else the larger one
 
-ROBOT, FIXED, OBJECT, HIDDEN = 1, 2, 4, 0  # collision categories; only the planner checks self-collision
-_COLLIDES_WITH = {ROBOT: 0, FIXED: ROBOT, OBJECT: ROBOT | FIXED | OBJECT, HIDDEN: 0}
+FIXED, OBJECT, HIDDEN = 2, 4, 0  # collision categories
+ROBOT = 0x7FFFFFF9  # mask of the categories of arms, one for each: only the planner checks self-collision
+_COLLIDES_WITH = {FIXED: ROBOT, OBJECT: ROBOT | FIXED | OBJECT, HIDDEN: 0}
+
+
+def arm_category(number: int) -> int:
+    """Return the collision category of an arm by its number."""
+    return OBJECT << number if number else 1
+
 
 # Geom groups for rendering: visual only, and collision only
 SEEN, COLLIDES = 2, 3
@@ -125,7 +132,8 @@ def wxyz(rotation: Array) -> list[float]:
 
 def set_contact(geom: Any, kind: int, *, group: int = 0) -> Any:
     """Set the contact parameters of a category on a geom (of an MjSpec); return the geom."""
-    geom.contype, geom.conaffinity, geom.group = kind, _COLLIDES_WITH[kind], group
+    others = _COLLIDES_WITH.get(kind, (kind - 1) & ROBOT)  # an arm: those of lower numbers
+    geom.contype, geom.conaffinity, geom.group = kind, others, group
     geom.condim = CONDIM if kind == OBJECT else 3
     geom.friction, geom.solref, geom.solimp = (SLIDING, TORSION, ROLLING), SOLREF, SOLIMP
     return geom
@@ -154,12 +162,12 @@ LIP, LIP_RADIUS = "lip", 0.002  # name of the body and actuator of a suction cup
 SOFT = (0.01, 1.0)  # time constant [s] and damping of a rubber lip
 
 
-def add_lip(spec: mujoco.MjSpec, tcp_link: str, cup: SuctionCup) -> None:
+def add_lip(spec: mujoco.MjSpec, tcp_link: str, cup: SuctionCup, category: int) -> None:
     """Add the lip of a suction cup, a ring of small spheres that protrude from the tool, and its adhesion actuator."""
     body = spec.body(tcp_link).add_body(name=LIP, gravcomp=1.0)
     for x, y in lip(cup)[1:]:
         geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[LIP_RADIUS, 0.0, 0.0], pos=[x, y, 0.0])
-        set_finger_contact(set_contact(geom, ROBOT, group=COLLIDES))
+        set_finger_contact(set_contact(geom, category, group=COLLIDES))
         geom.mass, geom.solref = 1e-4, SOFT
         geom.gap = cup.give  # within it the cup pulls, without touching yet
     actuator = spec.add_actuator(name=LIP, target=LIP, trntype=mujoco.mjtTrn.mjTRN_BODY)
@@ -234,12 +242,12 @@ def _add_container(spec: mujoco.MjSpec, c: Container, table: float) -> None:
         set_contact(geom, FIXED)
 
 
-def add_cameras(spec: mujoco.MjSpec, world: Surroundings, robot: RobotModel | None) -> None:
-    """Add the cameras of the world by name, on their mounts."""
+def add_cameras(spec: mujoco.MjSpec, world: Surroundings, robot: RobotModel, prefix: str) -> None:
+    """Add the cameras of the world by name, on their mounts; names of the robot's links begin with `prefix`."""
     for name, camera in world.cameras.items():
         body: Any = spec.worldbody
-        if camera.mount and robot is not None:
-            body = spec.body(robot.config.tcp_link if camera.mount == TCP else camera.mount)
+        if camera.mount:
+            body = spec.body(prefix + (robot.config.tcp_link if camera.mount == TCP else camera.mount))
         body.add_camera(name=name, pos=camera.position, quat=camera_quaternion(rpy_to_matrix(*camera.rpy)),
                         fovy=field_of_view(camera), resolution=[camera.width, camera.height])
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -25,7 +26,16 @@ from common.sim.kinematic import KinematicWorld
 from common.sim.suction import NOTHING, seal_problem
 from drivers.mujoco.arm import PhysicsArm, tune
 from drivers.mujoco.belts import PhysicsBelts
-from drivers.mujoco.model import REST_SPEED, CellModel, Contacts, ObjectStates, build_model, pose_changed, snap_upright
+from drivers.mujoco.model import (
+    REST_SPEED,
+    CellModel,
+    Contacts,
+    ObjectStates,
+    build_model,
+    pose_changed,
+    prefix,
+    snap_upright,
+)
 from drivers.mujoco.scene import DEFAULT_MASS, ROBOT, TIMESTEP, SceneObject
 
 Array = NDArray[np.float64]
@@ -38,7 +48,7 @@ ASLEEP = 1e-3  # [m/s] or [rad/s]: smaller velocities are restored as zero
 
 
 class PhysicsWorld(WorldEvents):
-    """The objects and the arm.
+    """The objects and the arms.
 
     Attributes:
         version: increases with every published change.
@@ -66,27 +76,33 @@ class PhysicsWorld(WorldEvents):
         self._slippery: dict[str, float] = {}  # end of the slip time [s]
         self._time: float | None = None
         self._published_at = -math.inf
+        self._robots: dict[str, RobotModel] = {}  # by arm
+        self._arms: dict[str, PhysicsArm] = {}
         self._cell: CellModel | None = None
         self._data: mujoco.MjData
         self._touching: tuple[set[str], set[str], set[str]] | None = None
 
-    # --- the arm ---
+    # --- the arms ---
 
     def hardware(self, robot: RobotModel, limits: Limits, start: Vector) -> Hardware:
-        """Return the arm in this world, at rest at `start` (dof,) [rad], with open fingers.
+        """Return the only arm in this world, at rest at `start` (dof,) [rad], with open fingers.
 
         Raises:
             ConfigError: the robot cannot be simulated.
         """
-        self._robot = robot
-        self._arm = PhysicsArm(robot, start, self.advance, self._seal)
+        return self.arm("", robot, limits, start)
+
+    def arm(self, name: str, robot: RobotModel, limits: Limits, start: Vector) -> Hardware:
+        """Return one more arm in this world: see `common.sim.interface.PhysicalWorldOfArms`."""
+        self._robots[name] = robot
+        self._arms[name] = arm = PhysicsArm(name, robot, start, self.advance, partial(self._seal, name))
         self._build()
         cell, data = self.simulation
-        cell.set_joints(data, robot.joint_names, start)
-        if self._arm.fingers is not None and robot.config.gripper is not None:
-            self._arm.fingers.place(robot.config.gripper.max_width)
+        cell.set_joints(data, [prefix(name) + joint for joint in robot.joint_names], start)
+        if arm.fingers is not None and robot.config.gripper is not None:
+            arm.fingers.place(robot.config.gripper.max_width)
         mujoco.mj_forward(cell.model, data)
-        return self._arm
+        return arm
 
     @property
     def simulation(self) -> tuple[CellModel, mujoco.MjData]:
@@ -101,8 +117,8 @@ class PhysicsWorld(WorldEvents):
         bodies = self._kinematic.bodies
         objects = [SceneObject(name, body.solid, body.color, self._masses.get(name, DEFAULT_MASS),
                                self._frictions.get(name)) for name, body in bodies.items()]
-        cell = build_model(self._robot, self._config, objects)
-        tune(cell, self._robot)
+        cell = build_model(self._robots, self._config, objects)
+        tune(cell, self._robots)
         data = mujoco.MjData(cell.model)
         data.qpos[:] = cell.start
         for name, body in bodies.items():
@@ -110,30 +126,34 @@ class PhysicsWorld(WorldEvents):
         if before is not None:
             _copy(*before, cell, data)
         mujoco.mj_forward(cell.model, data)
-        self._cell, self._data, self._contacts = cell, data, Contacts(cell, self._robot)
+        self._cell, self._data, self._contacts = cell, data, Contacts(cell, self._robots)
         self._drives = PhysicsBelts(self._config, cell, self.belts)
         for name in self._slippery:
             self._set_robot_contact(name, False)
         self._qpos = np.array([i for at in cell.objects.values() for i in range(at.qpos, at.qpos + 7)], int)
         self._touching, self._last_qpos = None, np.full(len(self._qpos), np.inf)
-        self._arm.attach(cell, data)
+        for arm in self._arms.values():
+            arm.attach(cell, data)
 
     # --- time ---
 
     def advance(self, now: float) -> None:
-        """Advance to a time [s]."""
-        cell, data = self.simulation
+        """Advance to a time [s]; do nothing if the world is there already, as another arm was read."""
+        (cell, data), arms = self.simulation, list(self._arms.values())
         if self._time is None or now - self._time > MAX_CATCH_UP:
             self._time = now
         steps = math.floor((now - self._time) / TIMESTEP + 1e-6)
         for _ in range(steps):
-            self._arm.drive(self._time)
+            for arm in arms:
+                arm.drive(self._time)
             self._drives.drive(data, self._time + TIMESTEP)
             mujoco.mj_step(cell.model, data)
-            self._arm.measure()
+            for arm in arms:
+                arm.measure()
             self._time += TIMESTEP
         if steps > 0:
-            self._arm.sense(self._time)
+            for arm in arms:
+                arm.sense(self._time)
             self._update(self._time)
             self._drives.update(data, self._kinematic.bodies)
 
@@ -144,8 +164,7 @@ class PhysicsWorld(WorldEvents):
             del self._slippery[name]
             self._set_robot_contact(name, True)
         contacts = self._contacts.update(data)
-        if (cup := self._arm.cup) is not None:
-            contacts = {cup.held} - {""}, *contacts[1:]
+        contacts[0].update(arm.cup.held for arm in self._arms.values() if arm.cup is not None and arm.cup.held)
         bodies = self._kinematic.bodies
         self._states.update(now, contacts, bodies)
         qpos = data.qpos[self._qpos]
@@ -170,10 +189,10 @@ class PhysicsWorld(WorldEvents):
             self._published_at = now
             self._publish_events(body)
 
-    def _seal(self) -> tuple[str, str]:
-        """Return the object that the suction cup seals on, else why it seals on none."""
-        cell, data = self.simulation
-        gripper, link = self._robot.config.gripper, data.body(self._robot.config.tcp_link)
+    def _seal(self, arm: str) -> tuple[str, str]:
+        """Return the object that the suction cup of an arm seals on, else why it seals on none."""
+        (cell, data), config = self.simulation, self._robots[arm].config
+        gripper, link = config.gripper, data.body(prefix(arm) + config.tcp_link)
         assert gripper is not None and gripper.cup is not None
         T_tcp_world, reason = invert(transform(link.xmat.reshape(3, 3), link.xpos)), NOTHING
         for name, body in self._kinematic.bodies.items():
@@ -297,8 +316,8 @@ class PhysicsWorld(WorldEvents):
         return next(iter(self._first_masses), "")
 
     def _slip(self, name: str) -> str:
-        held = self.held
-        if not held or name not in ("", held):
+        held = name or self.held
+        if held not in self._kinematic.bodies or self._kinematic.bodies[held].state != "held":
             raise Refused("not_held", f"{name or 'nothing'} is {'not ' if name else ''}between the fingers")
         self._set_robot_contact(held, False)
         self._slippery[held] = (self._time or 0.0) + SLIP_TIME

@@ -75,7 +75,7 @@ class SimulatedPick:
                                    config.robot.gripper)
         self._hardware = load_hardware(config.robot, limits, start)
         self._cell = SimulatedCell(self._world, self._hardware, robot)
-        self._renderer = load_renderer(config.world, config.world, lambda: robot, plain=True,
+        self._renderer = load_renderer(config.world, config.world, lambda: [robot], plain=True,
                                        camera=Pinhole.from_config(config.world.camera))
         self.now, self.q, self.dq = 0.0, start.copy(), np.zeros(robot.dof)
         self.limits_broken = self.contacts = 0

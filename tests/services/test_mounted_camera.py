@@ -89,11 +89,11 @@ async def test_image_waits_for_its_transform_and_is_skipped_without_one() -> Non
 def test_moved_camera_renders_like_a_new_one() -> None:
     things, there = spheres([(0.4, -0.1, 0.03), (0.5, 0.05, 0.03)]).objects, MOUNTED.at(HOME + 0.1)
     joints = JointState(header=Header(), name=ROBOT.joint_names, position=HOME.tolist())
-    for robot in (None, ROBOT):
-        moved = Renderer(AROUND, robot, plain=robot is None, camera=MOUNTED.at())
+    for robots in ([], [ROBOT]):
+        moved = Renderer(AROUND, *robots, plain=not robots, camera=MOUNTED.at())
         before = moved.render(things, joints).colour.copy()
         moved.move_camera(there)
-        fresh = Renderer(AROUND, robot, plain=robot is None, camera=there)
+        fresh = Renderer(AROUND, *robots, plain=not robots, camera=there)
         seen, expected = moved.render(things, joints), fresh.render(things, joints)
         np.testing.assert_array_equal(seen.colour, expected.colour)
         np.testing.assert_array_equal(seen.depth, expected.depth)

@@ -66,8 +66,8 @@ def test_balls_are_found_in_rendered_light_and_shadow(number):
     locked = robot.config.locked_joints
     joints = JointState(header=Header(), name=[*robot.joint_names, *locked], position=[*q.tolist(), *locked.values()])
     sensor = CameraParameters(auto_exposure=True, full_well=10_000)
-    eye = SimulatedCamera(AROUND, lit, CELL.robot, sensor, rng, plain=True)
-    assert_found(eye.capture(WorldObjects(objects=BALLS), joints, 0).colour)
+    eye = SimulatedCamera(AROUND, lit, [CELL.robot], sensor, rng, plain=True)
+    assert_found(eye.capture(WorldObjects(objects=BALLS), [joints], 0).colour)
 
 
 @pytest.mark.parametrize(("color", "count"), [

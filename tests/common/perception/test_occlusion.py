@@ -26,7 +26,7 @@ def robot() -> RobotModel:
 @pytest.mark.parametrize("camera", [ABOVE, SIDE], ids=["above", "side"])
 def test_occlusion_covers_the_rendered_arm_tightly(robot: RobotModel, camera: Pinhole) -> None:
     silhouettes, rng = RobotSilhouettes(robot), np.random.default_rng(1)
-    renderer, empty = (Renderer(AROUND, one, plain=True, camera=camera) for one in (robot, None))
+    renderer, empty = (Renderer(AROUND, *shown, plain=True, camera=camera) for shown in ([robot], []))
     for _ in range(2):
         q = robot.named("home") + rng.uniform(-0.6, 0.6, 7)
         state = JointState(header=Header(), name=list(robot.joint_names), position=q.tolist(), velocity=[], effort=[])

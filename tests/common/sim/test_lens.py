@@ -87,16 +87,16 @@ def test_joints_are_extrapolated_back_by_their_velocities():
 
 
 def camera(config: CameraParameters):
-    return SimulatedCamera(CELL.world, Scenery(), CELL.robot, config, np.random.default_rng(0), plain=True)
+    return SimulatedCamera(CELL.world, Scenery(), [CELL.robot], config, np.random.default_rng(0), plain=True)
 
 
 def test_motion_blur_equals_the_motion_within_the_exposure():
     def height(sub_exposures: int) -> int:
         """Of the picture of a sphere that moves by 2 m/s along x [px]."""
         one = camera(CameraParameters(sub_exposures=sub_exposures))
-        table = one.capture(WorldObjects(), None, 0).colour.astype(int)
-        one.capture(sphere(0.40, 0), None, 0)
-        picture = one.capture(sphere(0.56, 80_000_000), None, 80_000_000).colour.astype(int)
+        table = one.capture(WorldObjects(), [None], 0).colour.astype(int)
+        one.capture(sphere(0.40, 0), [None], 0)
+        picture = one.capture(sphere(0.56, 80_000_000), [None], 80_000_000).colour.astype(int)
         changed = np.argwhere(np.abs(picture - table).max(axis=2) > 8)
         return np.ptp(changed[np.abs(changed[:, 1] - 320) < 3][:, 0])
 
@@ -106,9 +106,9 @@ def test_motion_blur_equals_the_motion_within_the_exposure():
 def test_changed_light_affects_the_next_image():
     config = CameraParameters()
     one = camera(config)
-    bright = one.capture(WorldObjects(), None, 0).colour
+    bright = one.capture(WorldObjects(), [None], 0).colour
     config.ambient = 20.0
-    assert one.capture(WorldObjects(), None, 0).colour.mean() == pytest.approx(bright.mean() * 370 / 500, rel=0.02)
+    assert one.capture(WorldObjects(), [None], 0).colour.mean() == pytest.approx(bright.mean() * 370 / 500, rel=0.02)
 
 
 def test_pose_error_moves_the_image_but_not_the_configured_pose():
@@ -116,8 +116,8 @@ def test_pose_error_moves_the_image_but_not_the_configured_pose():
     def middle(*error: float) -> np.ndarray:
         """Of the picture of a sphere [px]."""
         one = camera(CameraParameters(pose_error=error))
-        table = one.capture(WorldObjects(), None, 0).colour.astype(int)
-        picture = one.capture(sphere(0.40, 0), None, 0).colour.astype(int)
+        table = one.capture(WorldObjects(), [None], 0).colour.astype(int)
+        picture = one.capture(sphere(0.40, 0), [None], 0).colour.astype(int)
         return np.argwhere(np.abs(picture - table).max(axis=2) > 8).mean(axis=0)[::-1]
 
     exact = middle(0, 0, 0, 0, 0, 0)

@@ -50,7 +50,7 @@ SMALL = camera(160, 120, 130, 130, 79.5, 59.5)
 
 def drawn(objects, joints=AWAY, *, scenery=None, view=SMALL, gl=GL, world=CELL.world):
     scenery = scenery or Scenery(lights={"above": ABOVE})
-    return PhysicsRenderer(world, scenery, ROBOT, view, depth=True, gl=gl).render(objects, joints)
+    return PhysicsRenderer(world, scenery, [ROBOT], view, depth=True, gl=gl).render(objects, joints)
 
 
 def red(picture):
@@ -126,7 +126,7 @@ def test_objects_cast_shadows_away_from_the_light():
 @needs_gl
 def test_dimmed_and_warm_light_change_level_and_colors():
     bright, dim, warm = (
-        PhysicsRenderer(CELL.world, Scenery(lights={"above": light}, ambient=0.2 * light.illuminance), ROBOT, SMALL,
+        PhysicsRenderer(CELL.world, Scenery(lights={"above": light}, ambient=0.2 * light.illuminance), [ROBOT], SMALL,
                         depth=False, gl=GL)
         for light in (ABOVE, ABOVE.model_copy(update={"illuminance": 35.0}),
                       ABOVE.model_copy(update={"temperature": 2700.0})))
@@ -139,7 +139,7 @@ def test_dimmed_and_warm_light_change_level_and_colors():
 def test_one_lamp_can_be_dimmed():
     lamps = {name: Light(position=(0.4, 3 * y, 1.0), aim=(0.4, y, 0.0), parallel=False, shadow=False)
              for name, y in (("left", 0.2), ("right", -0.2))}  # +y is left in the image
-    renderer = PhysicsRenderer(CELL.world, Scenery(lights=lamps), ROBOT, SMALL, depth=False, gl=GL)
+    renderer = PhysicsRenderer(CELL.world, Scenery(lights=lamps), [ROBOT], SMALL, depth=False, gl=GL)
     both = renderer.render([], AWAY).colour * renderer.level
     renderer.set_light(Scenery(lights=lamps | {"right": lamps["right"].model_copy(update={"illuminance": 20.0})}))
     one = renderer.render([], AWAY).colour * renderer.level
@@ -157,7 +157,7 @@ def test_lamp_lights_only_its_cone(gl):
 
 
 def test_elsewhere_is_not_rendered_and_unchanged_scenes_are_cached():
-    renderer = PhysicsRenderer(CELL.world, Scenery(), ROBOT, SMALL, depth=False, gl="")
+    renderer = PhysicsRenderer(CELL.world, Scenery(), [ROBOT], SMALL, depth=False, gl="")
     things = balls()
     first = renderer.render(things, AWAY)
     assert renderer.render(list(things), AWAY) is first
@@ -171,13 +171,13 @@ def test_failing_opengl_falls_back_to_ray_casting(monkeypatch, caplog, error):
         raise error("no glGetError")
 
     monkeypatch.setattr(gl, "gl_context", broken)
-    renderer = PhysicsRenderer(CELL.world, Scenery(), ROBOT, SMALL, depth=False, gl="egl")
+    renderer = PhysicsRenderer(CELL.world, Scenery(), [ROBOT], SMALL, depth=False, gl="egl")
     assert red(renderer.render(balls(), AWAY).colour).any()
     assert "ray-cast, without shadows: OpenGL (egl) fails: no glGetError" in caplog.text
 
 
 def test_renderer_follows_the_simulator_of_the_cell(monkeypatch):
     monkeypatch.setattr(gl, "select_gl", lambda: "")
-    found = load_renderer(CELL.world, Scenery(simulator="mujoco"), lambda: ROBOT, plain=True, camera=SMALL)
+    found = load_renderer(CELL.world, Scenery(simulator="mujoco"), lambda: [ROBOT], plain=True, camera=SMALL)
     assert isinstance(found, PhysicsRenderer) and found.needs_arm
-    assert not load_renderer(CELL.world, Scenery(), lambda: ROBOT, plain=True, camera=SMALL).needs_arm
+    assert not load_renderer(CELL.world, Scenery(), lambda: [ROBOT], plain=True, camera=SMALL).needs_arm

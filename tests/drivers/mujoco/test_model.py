@@ -32,7 +32,7 @@ def model_of(cell: str, visuals: bool = False, world: World | None = None) -> tu
     world, robot = world or config.world, RobotModel.load(config.robot)
     objects = [SceneObject(thing.id, solid_of_message(thing), (thing.color.r, thing.color.g, thing.color.b))
                for thing in KinematicWorld(world).objects(Header()).objects]
-    return robot, build_model(robot, world, objects, visuals=visuals)
+    return robot, build_model({"": robot}, world, objects, visuals=visuals)
 
 
 def at_start(cell_model: CellModel) -> mujoco.MjData:
@@ -63,7 +63,7 @@ def test_joint_without_range_is_locked() -> None:
                                     'iyy="0.01" izz="0.01"/></inertial></link><joint name="latch" type="revolute">'
                                     '<parent link="panda_link7"/><child link="lid"/><axis xyz="1 0 0"/><limit lower="0"'
                                     ' upper="0" effort="1" velocity="1"/></joint></robot>')
-    cell_model = build_model(robot, config.world, [])
+    cell_model = build_model({"": robot}, config.world, [])
     data = at_start(cell_model)
     data.qvel[cell_model.dofs["latch"]] = 1.0
     mujoco.mj_step(cell_model.model, data, 100)
@@ -75,7 +75,7 @@ def test_home_pose_and_objects_that_are_not_placed_have_no_contacts(cell: str) -
     config = load_cell(cell)
     box = solid_of(ObjectConfig(id="box", shape="box", size=[0.02, 0.02], height=0.02, x=0.0, y=0.0))
     objects = [SceneObject(f"box_{k}", box, (1.0, 0.0, 0.0)) for k in range(100)]
-    cell_model = build_model(RobotModel.load(config.robot), config.world, objects)
+    cell_model = build_model({"": RobotModel.load(config.robot)}, config.world, objects)
     mujoco.mj_forward(cell_model.model, data := at_start(cell_model))
     assert data.ncon == 0
 
