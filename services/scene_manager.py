@@ -35,7 +35,8 @@ class Config(ViewsParameters, SceneParameters):
 
 async def run(bus: Bus, config: Config) -> None:
     """Publish the planning scene after each detection message and each change of the gripper."""
-    views = DetectionViews(bus, config.views, config.world, config.robot, bus.log, only_at_home=config.only_at_home)
+    views = DetectionViews(bus, config.views, config.world, config.robot, config.arms, bus.log,
+                           only_at_home=config.only_at_home)
     joints = bus.reader(topics.JOINT_STATES)
     gripper = bus.reader(topics.GRIPPER_STATE)
     others = [OtherArm(bus, name, other) for name, other in config.arms.robots.items()

@@ -24,7 +24,7 @@ from applications.pick_place.topics import (
     WORKSPACE_MARKERS,
 )
 from applications.pick_place.tracks import Place
-from common.config import Grasp, RobotConfig, Surroundings, Tunable
+from common.config import Arms, Grasp, RobotConfig, Surroundings, Tunable
 from common.messages import Color, Header, Marker, MarkerArray, Pose, PoseArray, Rejections, Vector3
 from common.messages.basics import MAX_POSES
 from common.process.service import main
@@ -41,6 +41,7 @@ class Config(ViewsParameters, WorkspaceBounds):
 
     world: Surroundings
     robot: RobotConfig
+    arms: Arms = Arms()
     grasp: Grasp
     may_hide: Tunable[float] = Field(
         MOST_HIDDEN, ge=0, le=1, description="part of the table within reach that may be hidden while it counts as seen"
@@ -118,7 +119,7 @@ def targets(visible: list[Place], occluded: list[Place], **fields: Any) -> PoseA
 
 async def run(bus: Bus, config: Config) -> None:
     """Validate every frame with the known reachability; compute that of new positions concurrently."""
-    views = DetectionViews(bus, config.views, config.world, config.robot, bus.log)
+    views = DetectionViews(bus, config.views, config.world, config.robot, config.arms, bus.log)
     validated, rejected = bus.writer(VALIDATED_TARGETS), bus.writer(REJECTED_TARGETS)
     markers = bus.writer(WORKSPACE_MARKERS)
     reach = ReachCache(RobotModel.load(config.robot), config.grasp, config)

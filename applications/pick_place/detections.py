@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -16,7 +17,7 @@ from pydantic import Field
 from applications.pick_place.ball_places import BallGeometry
 from applications.pick_place.topics import DETECTED_OBJECTS
 from common import topics
-from common.config import Parameters, RobotConfig, Surroundings
+from common.config import Arms, Parameters, RobotConfig, Surroundings
 from common.messages import Marker, MarkerArray, Rejection, Vector3
 from common.messages.camera import INSIDE_CONTAINER, PARTLY_OUT_OF_VIEW
 from common.perception.camera_input import FrameError, SkippedFrames, require_capacity
@@ -60,8 +61,8 @@ class DetectionViews:
     """Readers of detections and camera info, one pair for each view; a view named left has its keys below `left/`."""
 
     def __init__(
-        self, bus: Bus, names: Sequence[str], around: Surroundings, robot: RobotConfig, log: logging.Logger, *,
-        only_at_home: bool = False,
+        self, bus: Bus, names: Sequence[str], around: Surroundings, robot: RobotConfig, arms: Arms,
+        log: logging.Logger, *, only_at_home: bool = False,
     ) -> None:
         """Declare the readers.
 
@@ -70,6 +71,7 @@ class DetectionViews:
             names: of the views; none means a single view without a prefix.
             around: which cameras are on the robot; only their images taken from home count.
             robot: its home pose.
+            arms: the others of the cell, which occlude too.
             only_at_home: treat all cameras like that.
             log: receives each reason for a skipped frame once.
         """
@@ -78,11 +80,12 @@ class DetectionViews:
         self._cameras = [
             CameraReader(bus, around, replace(topics.CAMERA_INFO, key=f"{at}{topics.CAMERA_INFO.key}")) for at in keys
         ]
-        self._joints = bus.reader(topics.JOINT_STATES)
+        self._arms = [(bus.of_arm(arm).reader(topics.JOINT_STATES), config)
+                      for arm, config in arms.including(robot).items()]
+        self._joints = self._arms[0][0]
         self._watches_home = only_at_home or around.on_hand
-        self._radius, self._config = around.ball_radius, robot
-        self._robot: tuple[RobotModel, RobotSilhouettes] | None = None
-        self._before: dict[int, RobotOcclusion] = {}
+        self._radius = around.ball_radius
+        self._before: dict[tuple[int, int], RobotOcclusion] = {}  # by view and arm
         self._views = list(names)
         self._names, self._home = robot.joints, HomeMonitor(robot.named_poses["home"])
         self._only_at_home = only_at_home
@@ -142,22 +145,27 @@ class DetectionViews:
     @property
     def robot(self) -> tuple[RobotModel, RobotSilhouettes]:
         """Robot model and silhouettes, loaded on first use."""
-        if self._robot is None:
-            robot = RobotModel.load(self._config)
-            self._robot = robot, RobotSilhouettes(robot, self._radius)
-        return self._robot
+        return self._robots[0]
+
+    @cached_property
+    def _robots(self) -> list[tuple[RobotModel, RobotSilhouettes]]:
+        models = [RobotModel.load(config) for _, config in self._arms]
+        return [(robot, RobotSilhouettes(robot, self._radius)) for robot in models]
 
     def _hidden(self, number: int, frame: MarkerArray, camera: Pinhole) -> Occlusion | None:
-        """Return what cannot be used in an image: all of it, or what the robot occludes."""
+        """Return what cannot be used in an image: all of it, or what robots occlude."""
         if frame.blind:
             return Occlusion(camera, frame.blind)
         if self._cameras[number].without_robot:
             return None
-        robot, silhouettes = self.robot
-        before = self._before.setdefault(number, RobotOcclusion(silhouettes))
-        state = self._joints.latest
-        q = robot.order(state.name, state.position) if state is not None else None
-        return before.in_image(camera, frame.header.stamp, q, state.header.stamp if state is not None else 0)
+        hidden: Occlusion | None = None
+        for arm, (robot, silhouettes) in enumerate(self._robots):
+            before = self._before.setdefault((number, arm), RobotOcclusion(silhouettes))
+            state = self._arms[arm][0].latest
+            q = robot.order(state.name, state.position) if state is not None else None
+            own = before.in_image(camera, frame.header.stamp, q, state.header.stamp if state is not None else 0)
+            hidden = own.joined(hidden) if own is not None else hidden
+        return hidden
 
     def _without_cut_off(self, number: int, frame: MarkerArray) -> MarkerArray:
         """Return the frame without detections cut off by its border that another view shows completely."""

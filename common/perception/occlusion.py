@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import coal
 import numpy as np
@@ -46,6 +46,12 @@ class Occlusion:
     def covers_image(self) -> bool:
         """Whether the complete image is unusable."""
         return self.distance is None
+
+    def joined(self, other: Occlusion | None) -> Occlusion:
+        """Return what this or the other one occludes in the same image."""
+        if other is None or self.distance is None or other.distance is None:
+            return self if other is None or self.distance is None else other
+        return replace(self, distance=np.minimum(self.distance, other.distance))
 
     def occludes(self, positions: npt.ArrayLike, radius: float = 0.0) -> Bools:
         """(n,) whether objects of a radius [m] at positions (n, 3) [m] in world are out of view or partly occluded."""
