@@ -54,6 +54,7 @@ two-arms: setup  ## two arms cross over one table: contacts by an independent ju
 	$(BIN)/python -m benchmarks.two_arms tasks --count 200 --jobs 2
 	$(BIN)/python -m benchmarks.two_arms cell --count 3
 	$(BIN)/python -m benchmarks.two_arms proofs --count 100
+	$(BIN)/python -m benchmarks.two_arms tasks --simulator mujoco --count 20 --jobs 2  # extra `physics`
 
 # Resumable: seeds that are in build/grasping.jsonl are not run again. Needs the extra: make setup EXTRAS=physics.
 grasping: setup  ## grasps of unseen objects by the complete sorting cell, hours; seeds as published in docs/grasping.md

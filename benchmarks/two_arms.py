@@ -3,7 +3,9 @@
 `tasks`: each arm picks and places at random in the shared middle and returns home, with real trajectory controllers and
 the coordinator on a virtual clock. An independent judge (pinocchio and coal, nothing of the proof) measures the
 distance of the arms along the recorded set-points of both at the same time, every 0.005 rad. The same tasks in turns,
-one motion at a time, are the comparison. `cell`: a whole cell, with cameras, planners and tasks, on the virtual clock.
+one motion at a time, are the comparison. With `--simulator mujoco` servos move the arms in a world with physics: the
+judge measures along the positions that the arms reach, and the contacts that MuJoCo computes between geoms of different
+arms in each step of 2 ms are counted. `cell`: a whole cell, with cameras, planners and tasks, on the virtual clock.
 `proofs`: time to prove motions of 5 s.
 """
 
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 
 from common import topics
 from common.arms import arms_topic
-from common.config import load_cell
+from common.config import World, load_cell
 from common.planning.arms.arm import Options
 from common.planning.arms.pair_world import PairWorld
 from common.planning.arms.timed_pairs import ArmMotion, PairProof, Schedule
@@ -30,6 +32,7 @@ from common.planning.arms.way_back import straight
 from common.planning.ik import solve_ik
 from common.planning.trajectory import TimedPath, join
 from common.robot.model import RobotModel
+from common.sim.interface import KINEMATIC
 from common.transport.bus import Bus
 from lab.simulation import Simulation
 from tests.two_arms import TwoArms, judged
@@ -57,6 +60,8 @@ class Outcome:
     retreats: int = 0
     unfinished: int = 0
     gap: float = 0.0
+    contacts: int = 0  # steps of physics with a contact between the arms
+    error: float = 0.0  # largest tracking error [rad]
 
 
 def place(robot: RobotModel, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -76,14 +81,14 @@ def place(robot: RobotModel, rng: np.random.Generator) -> tuple[Array, Array]:
             return above, at
 
 
-def task(seed: int, turns: bool, judge: bool) -> Outcome:
+def task(seed: int, turns: bool, judge: bool, simulator: str = KINEMATIC) -> Outcome:
     """Let both arms pick and place.
 
     A motion that is refused for a retreat is requested again from where the arm is; a place that the other arm blocks
     even at home is replaced by another one.
     """
     rng = np.random.default_rng(seed)
-    sim = TwoArms(Options(turns=turns), seed=seed)
+    sim = TwoArms(Options(turns=turns), seed=seed, world=None if simulator == KINEMATIC else World(simulator=simulator))
     outcome, stages, pauses = Outcome(seed), dict[str, list[list[Array]]](), dict[str, float]()
     for name, robot in sim.robots.items():
         places = [place(robot, rng) for _ in range(2)]
@@ -93,6 +98,7 @@ def task(seed: int, turns: bool, judge: bool) -> Outcome:
 
     def each() -> None:
         nonlocal number
+        outcome.error = max(outcome.error, *(float(np.abs(arm.q - arm.measured).max()) for arm in sim.arms.values()))
         for name, arm in sim.arms.items():
             result = sim.results.get(goals[name])
             if result is not None and result.state:
@@ -120,7 +126,7 @@ def task(seed: int, turns: bool, judge: bool) -> Outcome:
     outcome.unfinished = sum(map(len, stages.values()))
     outcome.makespan = max(result.over for goal, result in sim.results.items() if not goal.startswith("retreat"))
     outcome.retreats = sum(goal.startswith("retreat") for goal in sim.results)
-    outcome.gap = sim.largest_gap
+    outcome.gap, outcome.contacts = sim.largest_gap, sim.contacts
     if judge:
         distances = sim.judged(0.005)
         outcome.distance, outcome.judged = min(distances), len(distances)
@@ -193,6 +199,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--simulator", choices=[KINEMATIC, "mujoco"], default=KINEMATIC, help="of `tasks`")
     given = parser.parse_args()
     if given.what == "proofs":
         print(proofs(given.count, given.seed))
@@ -205,13 +212,13 @@ def main() -> None:
     seeds = range(given.seed, given.seed + given.count)
     with ProcessPoolExecutor(given.jobs) as pool:
         at_once = []
-        for one in pool.map(partial(task, turns=False, judge=True), seeds):
+        for one in pool.map(partial(task, turns=False, judge=True, simulator=given.simulator), seeds):
             at_once.append(one)
             print(one, flush=True)
-        print("in turns", flush=True)
-        in_turns = list(pool.map(partial(task, turns=True, judge=False), seeds))
-    ratios = [b.makespan / a.makespan for a, b in zip(at_once, in_turns, strict=True)
-              if not a.unfinished | b.unfinished]
+        in_turns = []
+        if given.simulator == KINEMATIC:
+            print("in turns", flush=True)
+            in_turns = list(pool.map(partial(task, turns=True, judge=False), seeds))
     print(f"tasks {len(at_once)}, seeds {seeds.start} to {seeds.stop - 1}; "
           f"contacts {sum(one.distance <= 0 for one in at_once)} in {sum(one.judged for one in at_once)} states; "
           f"least distance {min(one.distance for one in at_once):.4f} m")
@@ -219,6 +226,12 @@ def main() -> None:
           f"places replaced {sum(one.replaced for one in at_once)}, "
           f"retreats {sum(one.retreats for one in at_once)}, largest gap of schedules "
           f"{max(one.gap for one in at_once):.3f} s")
+    if not in_turns:
+        print(f"steps of physics with a contact between the arms: {sum(one.contacts for one in at_once)}; "
+              f"largest tracking error {max(one.error for one in at_once):.4f} rad")
+        return
+    ratios = [b.makespan / a.makespan for a, b in zip(at_once, in_turns, strict=True)
+              if not a.unfinished | b.unfinished]
     print(f"makespan in turns / at once: mean {np.mean(ratios):.2f}, 5 to 95 % "
           f"{np.percentile(ratios, 5):.2f} to {np.percentile(ratios, 95):.2f}; "
           f"sum {sum(b.makespan for b in in_turns) / sum(a.makespan for a in at_once):.2f}")

@@ -1,6 +1,7 @@
 """Two Pandas that face each other over one table: real trajectory controllers and the coordinator on a virtual clock.
 
-The judge uses pinocchio and coal on the set-points of both arms at the same time, and nothing of the proof.
+The judge uses pinocchio and coal on the positions of both arms at the same time, and nothing of the proof. Those are the
+set-points, or what is measured in a world with physics, which counts contacts itself, too.
 """
 
 import heapq
@@ -12,8 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from common.config import World
 from common.config.loading import load_robot
 from common.control.trajectory_controller import TrajectoryController
+from common.hardware.interface import Hardware
 from common.planning.arms import way_back
 from common.planning.arms.arm import Observed, Options
 from common.planning.arms.coordinator import Coordinator, Retreat
@@ -22,6 +25,7 @@ from common.planning.arms.schedules import Cancel, ScheduleKeeper
 from common.planning.ik import solve_ik
 from common.planning.trajectory import TimedPath, trajectory_message
 from common.robot.model import RobotModel
+from common.sim.interface import load_world
 from lab.arm_distance import ArmDistance
 
 Array = NDArray[np.float64]
@@ -62,6 +66,8 @@ class SimulatedArm:
     operator_hold: bool = False
     scaling: float = 1.0
     stopped: bool = False
+    hardware: Hardware | None = None  # in a world with physics
+    measured: Array = field(default_factory=lambda: np.empty(0))  # without physics the set-point
 
 
 class TwoArms:
@@ -70,8 +76,12 @@ class TwoArms:
     def __init__(
         self, options: Options | None = None, *, message: float = 0.01, seed: int = 0, distance: float = DISTANCE,
         line: Callable[[str, Array, Array], bool] | None = lambda *_: True, coordinate: bool = True,
+        world: World | None = None,
     ) -> None:
-        """Both arms at home; messages take `message` [s]; `line` says where a straight way home is free."""
+        """Both arms at home; messages take `message` [s]; `line` says where a straight way home is free.
+
+        Servos move the arms in a world with physics, if given.
+        """
         self.now, self.message, self.coordinate = 0.0, message, coordinate
         self.rng = np.random.default_rng(seed)
         self.robots = robots(distance)
@@ -90,6 +100,32 @@ class TwoArms:
         self._next_tick = 0.0
         self.largest_gap = 0.0  # of the lags of two committed arms, seen by their true progress [s]
         self.alive = True  # the coordinator
+        self.contacts = 0  # steps of physics in which a link of one arm touches one of the other
+        self.physics: Any = None
+        if world is not None:
+            self._enter(world)
+
+    def _enter(self, world: World) -> None:
+        self.physics = load_world(world, world.objects, None, self.robots["left"].config.gripper)
+        for name, arm in self.arms.items():
+            arm.hardware = last = self.physics.arm(name, arm.robot, self.coordinator.arms[name].limits, arm.q)
+        measure = last.measure
+
+        def measured() -> None:
+            """Look for contacts after each step."""
+            measure()
+            self.contacts += bool(self.touching())
+
+        last.measure = measured
+
+    def touching(self) -> list[tuple[str, str]]:
+        """Return the bodies of different arms that touch each other now, by MuJoCo."""
+        from drivers.mujoco.scene import ROBOT
+
+        cell, data = self.physics.simulation
+        model, pairs = cell.model, data.contact.geom[data.contact.dist <= 0].astype(int)
+        return [tuple(model.body(model.geom_bodyid[geom]).name for geom in pair) for pair in pairs
+                if (model.geom_contype[pair] & ROBOT).all()]
 
     def later(self, delay: float, action: Callable[[], None]) -> None:
         """Run an action after a delay [s]."""
@@ -148,7 +184,7 @@ class TwoArms:
                 heapq.heappop(self._queue)[2]()
             for arm in self.arms.values():
                 self._cycle(arm)
-            self.states.append((self.now, self.arms["left"].q.copy(), self.arms["right"].q.copy()))
+            self.states.append((self.now, self.arms["left"].measured.copy(), self.arms["right"].measured.copy()))
             if self.coordinate and self.alive and self.now >= self._next_tick:
                 self._next_tick = self.now + TICK
                 self._tick()
@@ -158,9 +194,13 @@ class TwoArms:
     def _cycle(self, arm: SimulatedArm) -> None:
         controller = arm.controller
         controller.reports.speed_scaling = arm.scaling
-        found = controller.update(self.now, arm.q, arm.dq)
+        q, dq = (arm.q, arm.dq) if arm.hardware is None else arm.hardware.read(self.now)
+        found = controller.update(self.now, q, dq)
         if found is not None:
             arm.q, arm.dq = found
+            if arm.hardware is not None:
+                arm.hardware.write(*found, self.now)
+        arm.measured = arm.q if arm.hardware is None else q
         status = controller.status
         if status.id in self.results and status.state not in ("active", "none") and not self.results[status.id].state:
             self._finish(status.id, status.state, status.error)
