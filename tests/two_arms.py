@@ -1,7 +1,7 @@
 """Two Pandas that face each other over one table: real trajectory controllers and the coordinator on a virtual clock.
 
-The judge uses pinocchio and coal on the positions of both arms at the same time, and nothing of the proof. Those are the
-set-points, or what is measured in a world with physics, which counts contacts itself, too.
+The judge uses pinocchio and coal on the positions of both arms at the same time, and nothing of the proof. Those are
+the set-points, or what is measured in a world with physics, which counts contacts itself, too.
 """
 
 import heapq
