@@ -7,7 +7,7 @@
     mujoco.mj_forward(cell.model, data)
 
 Frames are the project's: link bodies have their URDF names and frames, world is world. With several arms, names of
-links, joints and servos begin with that of the arm: `left/panda_link0`. Geoms of group `scene.SEEN` are only
+links, joints and servos begin with that of the arm: `left/link0`. Geoms of group `scene.SEEN` are only
 visual, those of `scene.COLLIDES` only collide, all others are both. Objects, floor, fixtures and containers have
 their configured colors; the model has no lights.
 """

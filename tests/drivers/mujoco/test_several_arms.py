@@ -46,8 +46,9 @@ def states(sim: TwoArms) -> dict[str, str]:
 
 def test_every_link_is_where_its_arm_has_it_and_every_joint_is_read_from_its_own_arm() -> None:
     sim = two_arms()
-    send(sim, "right", 0.7, 0.2, 0.3)
-    sim.run(4.0)
+    goal = send(sim, "right", 0.7, 0.2, 0.3)
+    while not sim.results[goal].state:
+        sim.run(0.5)
     _, data = sim.physics.simulation
     for arm, robot in sim.robots.items():
         q = sim.arms[arm].measured
