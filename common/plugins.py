@@ -64,6 +64,8 @@ def find_plugin(group: str, name: str, *, field: str, noun: str, marker: str = "
         UnknownName: no plug-in has that plain name; lists the choices.
         ConfigError: the module cannot be imported.
     """
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise UnknownName(noun, name, plugin_names(group, marker))
     try:
         if "." in name:
             import_from_working_directory(name)

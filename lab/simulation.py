@@ -115,7 +115,7 @@ class Simulation:
                 fault for fault in self.plan.faults if fault.kind not in OPERATOR_FAULTS))
         self.outcome = Outcome(seed)
         self._limit, self._trace, self._log, self._visit = limit, trace, log, visit
-        self._visit_error: Exception | None = None
+        self._visit_error: BaseException | None = None
         self._hash = hashlib.blake2b(digest_size=16) if digest else None
         self._status = find_application(cell.application).status
         self._status_key = f"{cell.name}/{self._status.key}"
@@ -226,7 +226,9 @@ class Simulation:
         bus = SimulatedBus(session, VISITOR, self.cell.name, host.clock, host.requests)
         try:
             await self._visit(bus)
-        except Exception as error:
+        except asyncio.CancelledError:
+            raise
+        except BaseException as error:  # a failed assertion of pytest is no Exception
             self._visit_error = error
             raise
         finally:

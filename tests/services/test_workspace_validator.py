@@ -91,8 +91,9 @@ async def test_detections_before_camera_info_are_dropped():
         cell.put(DETECTED_OBJECTS, detections(GOOD, stamp=1))
         await settle()
         cell.calibrate(CAMERA, AROUND.camera.frame)
-        await cell.answer(detections(GOOD, stamp=2), 1)
-        assert cell.targets.received == 1
+        cell.put(DETECTED_OBJECTS, detections(GOOD, stamp=2))
+        first = await until(cell.targets)  # on a busy machine without the position that is still being computed
+        assert first.header.stamp == 2
 
 
 async def test_bounds_changed_live_affect_targets_and_markers(cell):

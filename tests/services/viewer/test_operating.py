@@ -61,7 +61,7 @@ async def test_command_is_sent_and_commands_without_effect_are_disabled(panda, p
     await page.press(command)
     await until(lambda: panda.commands)
     assert panda.commands == [command.lower()]
-    assert {label: page.button(label)[1] for label in others} == others
+    await page.until(lambda: {label: page.button(label)[1] for label in others} == others)
 
 
 async def test_hold_of_another_operator_is_overridden_by_pressing_twice(panda: FakeServices, page: FakeBrowser) -> None:
