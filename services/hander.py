@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 
-from applications.hand_over.task import Giver, Receiver
+from applications.hand_over.task import Config, Giver, Receiver
 from applications.hand_over.topics import HANDOVER_STATUS
 from common.process.other_arms import OtherArm
 from common.process.service import main
 from common.process.task_runner import run_task
-from common.tasks.handover import HandoverConfig as Config
 from common.tasks.handover import HandoverView
 from common.transport.bus import Bus
 

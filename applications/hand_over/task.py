@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from common import messages as m
-from common.tasks.handover import WAITS, Giving, HandoverView, Receiving
+from common.tasks.handover import WAITS, Giving, HandoverConfig, HandoverView, Receiving
 from common.tasks.stages import View
+
+
+class Config(HandoverConfig):
+    """Parameters of the task of one arm: of the giver or of the receiver."""
 
 
 class Giver(Giving):

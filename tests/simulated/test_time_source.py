@@ -14,6 +14,7 @@ SINGLE = (
 )
 REAL = tuple(f"common/{name}.py" for name in (  # of real arms and cameras, which no simulation has
     "hardware/driven_arm", "hardware/driver_process", "hardware/driven_gripper"))
+REAL += ("applications/programming/scripted.py",)  # of exported scripts, which wait in a process of the operator
 REAL_SOURCES = {"time", "uuid", "secrets", "random", "datetime"}
 
 
