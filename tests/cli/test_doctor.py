@@ -115,7 +115,8 @@ def test_extras_are_named(monkeypatch):
 def test_robots_and_cells_of_the_project_are_well():
     found = [(finding.level, finding.what.split(":")[0]) for finding in (*examination.robots(), *examination.cells())]
     names = {"robot": ("fr3", "panda", "ur5", "ur5_cup"), "cell": (
-        "conveyor", "duo", "handover", "insertion", "panda", "policy_panda", "sorting", "sorting_ur5", "tending", "ur5")}
+        "conveyor", "duo", "handover", "insertion", "panda", "policy_panda", "sorting", "sorting_ur5",
+        "tending", "ur5")}
     assert found == [("ok", f"{kind} {name}") for kind in names for name in names[kind]]
 
 
