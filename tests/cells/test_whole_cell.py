@@ -43,6 +43,9 @@ def up(tmp_path_factory: pytest.TempPathFactory):
         async def ready() -> None:
             async with cell.listen() as bus:
                 await until(bus.reader(topics.SUPERVISOR_STATUS), all_ready)
+            async with asyncio.timeout(30.0):
+                while "zenoh --mode" not in cell.text:  # printed after that status was published
+                    await asyncio.sleep(0.05)
 
         asyncio.run(ready())
         yield cell

@@ -66,6 +66,7 @@ def examples(joints: list[str]) -> dict[type[m.Message], m.Message]:
         m.MotionOwner(header=WORLD, owner="anna", kind="operator", since=1, asked=True),
         m.RobotStatus(header=WORLD, mode="fault", message="a", controller=True),
         m.GripperState(header=WORLD, width=0.1, message="a"),
+        m.Wrench(header=WORLD, force=m.Vector3(x=1.0), torque=m.Vector3(y=0.1), reason="a"),
         m.SupervisorStatus(header=WORLD, cell="a", notices=[m.Notice(message="a")], services=[
             m.ServiceStatus(name="a", state="ready", pid=1, restarts=1, ready_seconds=1.0, message="a")]),
         m.ServiceCounters(header=WORLD, service="tester", writes=["b"], received={"b": 1}, dropped={"b": 1},

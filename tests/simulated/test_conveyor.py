@@ -50,11 +50,11 @@ def test_belt_that_stops_before_the_grasp_ends_the_motion_with_open_fingers_and_
         status, set_ = bus.reader(BELT_PICKING_STATUS), bus.client(topics.CONVEYOR_SET)
         await until(status, lambda one: one.stage == "track")
         await until(motion, lambda one: one.state == "active" and one.progress > 0.3)
-        await set_.call(ConveyorSet(running=False))
+        await set_.call(ConveyorSet(running=False, owner="belt_picker"))
         ended: MotionStatus = await until(motion, lambda one: one.state != "active")
         open_: GripperState = await until(gripper, lambda _: True)
         seen.update(state=ended.state, progress=ended.progress, width=open_.width)
-        await set_.call(ConveyorSet(running=True))
+        await set_.call(ConveyorSet(running=True, owner="belt_picker"))
 
     outcome = Simulation(cell(-0.3, 0.08), 1, limit=90.0, visit=visit).run()
     assert (outcome.state, outcome.done, outcome.crashes, outcome.broken) == ("DONE", 1, [], []), outcome
