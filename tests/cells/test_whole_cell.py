@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import psutil
@@ -43,11 +44,12 @@ def up(tmp_path_factory: pytest.TempPathFactory):
         async def ready() -> None:
             async with cell.listen() as bus:
                 await until(bus.reader(topics.SUPERVISOR_STATUS), all_ready)
-            async with asyncio.timeout(30.0):
-                while "zenoh --mode" not in cell.text:  # printed after that status was published
-                    await asyncio.sleep(0.05)
 
         asyncio.run(ready())
+        deadline = time.monotonic() + 30.0
+        while "zenoh --mode" not in cell.text:  # printed after that status was published
+            assert time.monotonic() < deadline, cell.tail()
+            time.sleep(0.05)
         yield cell
 
 
