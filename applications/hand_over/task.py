@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from common import messages as m
 from common.tasks.handover import WAITS, Giving, HandoverConfig, HandoverView, Receiving
-from common.tasks.stages import View
+from common.tasks.stages import DwellTimer, View
+
+COUNTED = 5.0  # [s] for images to show in the container what was put there
 
 
 class Config(HandoverConfig):
@@ -36,12 +38,19 @@ class Giver(Giving):
 class Receiver(Receiving):
     """Puts what it takes into the container next to it."""
 
+    def __init__(self, config: Config, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
+        """Start without an object; the arguments are those of `Task`."""
+        super().__init__(config, status, prefix, speed)
+        self._counting = DwellTimer()
+
     def choose(self, view: View) -> None:
         """Wait for an offer; end with the task of the giver."""
         assert isinstance(view, HandoverView)
         partner = view.partner
         if partner is not None and partner.status is not None and partner.status.state == "DONE":
-            self.finish(view)
+            counted = self.status.done >= partner.status.total
+            if self._counting.elapsed("the giver is done", view.now) >= COUNTED or counted:
+                self.finish(view)
         elif not self.ends_with(partner, view):
             self.status.message = f"{WAITS} {self.p.partner} offers an object"
 
