@@ -6,6 +6,7 @@ A task of the user implements `decide` and overrides other hooks only where it d
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from typing import Generic, Literal, TypeVar
 
@@ -49,7 +50,7 @@ class TaskConfig(Parameters):
     )
 
 
-class TaskDecisions(Generic[V]):
+class TaskDecisions(ABC, Generic[V]):
     """Hooks and helpers of a task. Only `decide` has no default."""
 
     p: TaskConfig
@@ -100,9 +101,9 @@ class TaskDecisions(Generic[V]):
 
     # --- hooks -----------------------------------------------------------------------------------------------
 
+    @abstractmethod
     def decide(self, view: V) -> None:
         """Append the next stages to `queue`, or set `status.state` to DONE; called while nothing runs."""
-        raise NotImplementedError
 
     def decide_ahead(self, running: Stage, view: V) -> None:
         """Append stages that follow the running one, so that they are planned meanwhile."""
@@ -186,8 +187,8 @@ class TaskDecisions(Generic[V]):
         return None
 
     def remember(self, memory: BaseModel) -> None:
-        """Continue from the memory of the task before its restart."""
-        raise NotImplementedError
+        """Continue from the memory of the task before its restart; every task that has a memory defines it."""
+        raise TypeError(f"{type(self).__name__} has a memory, but does not define `remember`")
 
     def home(self, view: V) -> Move:
         """Return the motion to the home pose, from which the cameras see everything, with a held object."""

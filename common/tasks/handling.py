@@ -8,6 +8,7 @@ after a restart, and skip an object for a while after a failed attempt.
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Literal
@@ -71,13 +72,13 @@ class Handling(Task[View]):
 
     # --- implemented by the task ---------------------------------------------------------------------------------
 
+    @abstractmethod
     def choose(self, view: View) -> None:
         """With empty gripper, at home and with a fresh image: call `bring`, `finish` or `lack`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def destination(self, thing: m.CollisionObject, view: View) -> m.Pose | None:
         """Return the pose of the held object's center in world; None puts it aside, to be seen first."""
-        raise NotImplementedError
 
     def opening(self, width: float | None) -> float:
         """Return the finger width before a grasp and at a release of an object of a width, None if unknown [m]."""

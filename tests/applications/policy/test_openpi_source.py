@@ -153,17 +153,22 @@ async def test_server_of_something_else_is_named(metadata, text):
 
 
 async def test_stalled_server_fails_in_time_and_its_late_answer_is_not_used():
-    answers = iter([0.3, 0.0])
+    first, failed, late = True, asyncio.Event(), asyncio.Event()
 
     async def infer(seen):
-        delay = next(answers)
-        await asyncio.sleep(delay)
-        return {"actions": np.full((1, 8), delay)}
+        nonlocal first
+        if not first:
+            return {"actions": np.zeros((1, 8))}
+        first = False
+        await failed.wait()
+        late.set()
+        return {"actions": np.ones((1, 8))}
 
     async with running(Server(infer)) as server:
         policy = made(server.address, timeout=0.15)
         assert "no answer within 0.15 s" in await failure(policy)
-        await asyncio.sleep(0.3)
+        failed.set()
+        await late.wait()
         assert (await policy.infer(SEEN)).values[0, 0] == 0.0
         assert len(server.connections) == 2
         await policy.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +12,7 @@ from common.tasks.engine import Task
 STEP, MOTION = 0.1, 0.45  # [s] of a step and of a motion
 
 
-class TaskDouble:
+class TaskDouble(ABC):
     """Plans succeed, motions take five steps; tests change the attributes to cause faults."""
 
     def __init__(self, task: Task[Any], gripper_width: float) -> None:
@@ -36,17 +37,17 @@ class TaskDouble:
     def header(self) -> m.Header:
         return m.Header(stamp=self.stamp)
 
+    @abstractmethod
     def view(self) -> Any:
         """Return what the task knows now."""
-        raise NotImplementedError
 
+    @abstractmethod
     def trajectory(self, request: m.PlanRequest) -> m.JointTrajectory:
         """Return the planned motion."""
-        raise NotImplementedError
 
+    @abstractmethod
     def grip(self, request: m.GripperCommand) -> m.GripperState:
         """Execute a gripper command and return the answer."""
-        raise NotImplementedError
 
     def arrive(self, request: m.ExecuteRequest) -> None:
         """End a motion."""
