@@ -6,8 +6,10 @@ import math
 
 import pytest
 
+from applications.peg_in_hole.figures import InsertionFigures
 from applications.peg_in_hole.task import Config
 from applications.peg_in_hole.topics import INSERTION_STATUS
+from common import messages as m
 from common import topics
 from common.config import load_cell, service_config
 from common.errors import ConfigError
@@ -67,3 +69,13 @@ def test_world_without_forces_is_refused_before_anything_moves() -> None:
     cell = load_cell("insertion", ["world.simulator=kinematic"])
     with pytest.raises(ConfigError, match=r"world\.simulator: 'kinematic' has no forces.*: use mujoco"):
         service_config(cell, "inserter", Config).require_usable()
+
+
+@pytest.mark.parametrize(("z", "state", "counted"), [(0.01, "table", 1), (0.06, "table", 0), (0.01, "held", 0)])
+def test_summary_counts_pegs_in_the_hole_by_ground_truth(z: float, state: str, counted: int) -> None:
+    figures = InsertionFigures()
+    figures.parameters = load_cell("insertion").services["inserter"].parameters
+    x, y, surface = figures.parameters["hole"]["position"]
+    peg = m.WorldObject(id="peg", shape="cylinder", state=state, pose=m.Pose(position=m.Vector3(x=x, y=y, z=surface + z)),
+                        size=m.Vector3(x=0.02, y=0.02, z=0.05))
+    assert figures.achieved(m.WorldObjects(objects=[peg])) == f"{counted} of 1 pegs in the hole"

@@ -7,6 +7,7 @@ from itertools import combinations
 
 import pytest
 
+from applications.tending.figures import TendingFigures
 from applications.tending.parts import Options, find_misplaced, generate
 from applications.tending.task import PALLET, Config, Part, Tending
 from applications.tending.topics import TendingStatus
@@ -97,3 +98,11 @@ def test_truth_check_names_what_is_not_in_a_slot_of_its_own(places: list[m.Pose]
     truth = m.WorldObjects(objects=[
         m.WorldObject(id=f"p{n}", shape="box", pose=pose, size=size) for n, pose in enumerate(places)])
     assert find_misplaced(truth) == message
+
+
+def test_summary_counts_parts_in_slots_of_their_own_by_ground_truth() -> None:
+    first, second = (slot.pose.position for slot in slots(PALLET)[:2])
+    truth = m.WorldObjects(objects=[
+        m.WorldObject(id=name, shape="box", state="table", pose=m.Pose(position=at))
+        for name, at in (("a", first), ("b", second), ("c", m.Vector3(x=0.3, y=-0.3)))])
+    assert TendingFigures().achieved(truth) == "2 of 3 parts on the pallet"
