@@ -76,6 +76,7 @@ def test_summary_counts_pegs_in_the_hole_by_ground_truth(z: float, state: str, c
     figures = InsertionFigures()
     figures.parameters = load_cell("insertion").services["inserter"].parameters
     x, y, surface = figures.parameters["hole"]["position"]
-    peg = m.WorldObject(id="peg", shape="cylinder", state=state, pose=m.Pose(position=m.Vector3(x=x, y=y, z=surface + z)),
+    pose = m.Pose(position=m.Vector3(x=x, y=y, z=surface + z))
+    peg = m.WorldObject(id="peg", shape="cylinder", state=state, pose=pose,
                         size=m.Vector3(x=0.02, y=0.02, z=0.05))
     assert figures.achieved(m.WorldObjects(objects=[peg])) == f"{counted} of 1 pegs in the hole"
