@@ -22,6 +22,8 @@ from common.process.service import main
 from common.robot.model import RobotModel
 from common.transport.bus import Bus
 
+RETRY = 0.1  # [s] wall time until the held object is looked up again
+
 
 class Config(ViewsParameters, SceneParameters):
     """Parameters of the tracking, and the sections that it needs."""
@@ -64,12 +66,16 @@ async def run(bus: Bus, config: Config) -> None:
         return T_world_tcp
 
     async def watch_gripper() -> None:
-        held: bool | None = None
-        async for state in gripper:
-            if state.holding != held:
-                held = state.holding
+        async for _ in gripper:
+            while True:
+                before = scene.held
                 update_gripper()
-                out.put(scene.scene())
+                if scene.held is not before:
+                    out.put(scene.scene())
+                assert gripper.latest is not None
+                if not (gripper.latest.holding and (scene.held is None or (others and scene.is_undetected))):
+                    break
+                await asyncio.sleep(RETRY)  # after a restart joints and other arms are known later than the gripper
 
     async def update(view: int, seen: CameraDetections) -> None:
         scene.update_detections(seen.frame, seen.camera, update_gripper(), view, seen.at_times, seen.hidden)

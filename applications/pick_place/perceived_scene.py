@@ -71,7 +71,7 @@ class PerceivedScene:
         self._unsorted: dict[int, list[Sighting]] = {}  # other objects in containers, by view
         self._undetected_width: float | None = None  # of a held object that no detector reported [m]
         self._has_balls = False  # whether a detector reported any
-        self._held: m.AttachedObject | None = None
+        self.held: m.AttachedObject | None = None  # by the gripper
         self.held_by_others: list[m.CollisionObject] = []  # by other arms of the cell, in world
         self._changed_hands_at = 0
         self._stamp = 0
@@ -89,7 +89,7 @@ class PerceivedScene:
             return
         self._stamp = max(self._stamp, stamp)
         hand = None
-        if self._held is not None and T_world_tcp is not None:
+        if self.held is not None and T_world_tcp is not None:
             hand = tuple(T_world_tcp[:3, 3])
         on_table: list[Sighting] = []
         unsorted: list[Sighting] = []
@@ -100,9 +100,9 @@ class PerceivedScene:
                 continue
             if thing.shape == "sphere" and not self._has_balls:
                 self._has_balls = True
-                if self._held is not None and self._undetected_width is not None:  # it may be one, too
-                    held = self._undetected(self._held.object.id, self._undetected_width)
-                    self._held = self._held.model_copy(update={"object": held})
+                if self.held is not None and self._undetected_width is not None:  # it may be one, too
+                    held = self._undetected(self.held.object.id, self._undetected_width)
+                    self.held = self.held.model_copy(update={"object": held})
             pixel = marker.pixel or tuple(camera.project(list(thing.position)))
             shown = [box for box in self._resting if box.shows_container(camera, pixel)]
             if shown and thing.shape == "sphere" and shown[0].container is self._with_slots:
@@ -147,11 +147,14 @@ class PerceivedScene:
 
     def update_gripper(self, gripper: m.GripperState, T_world_tcp: Array | None) -> None:
         """Process a change of the gripper: the nearest object becomes the held one with its id, or it is released."""
-        if gripper.holding == (self._held is not None) or (gripper.holding and T_world_tcp is None):
+        if self.held is not None and self._undetected_width is not None and gripper.holding and (
+                T_world_tcp is not None) and (other := self._handed_over(T_world_tcp)) is not None:
+            self._know(other)
+        if gripper.holding == (self.held is not None) or (gripper.holding and T_world_tcp is None):
             return
         self._changed_hands_at = gripper.header.stamp
         if not gripper.holding or T_world_tcp is None:
-            self._held = None
+            self.held = None
             return
         # A released object may be seen while it falls, as high as if it lay on another one. It is one more object in
         # the container then, not two. Before the first image no slot is known to be free.
@@ -178,9 +181,20 @@ class PerceivedScene:
         thing = self._object(track.id, "attached", track.sighting, pose) if track else self._undetected(
             self._tracks.new_id(), gripper.width)
         self._undetected_width = None if track else gripper.width
+        self.held = m.AttachedObject(link=self.tcp_link, object=thing)
         if track is None and (other := self._handed_over(T_world_tcp)) is not None:
-            thing, self._undetected_width = other.model_copy(update={"id": thing.id}), None
-        self._held = m.AttachedObject(link=self.tcp_link, object=thing)
+            self._know(other)
+
+    def _know(self, other: m.CollisionObject) -> None:
+        """Take over what another arm, which holds the same object, knows of it; the id stays."""
+        assert self.held is not None
+        known = other.model_copy(update={"id": self.held.object.id})
+        self.held, self._undetected_width = self.held.model_copy(update={"object": known}), None
+
+    @property
+    def is_undetected(self) -> bool:
+        """Whether only the fingers know the held object."""
+        return self._undetected_width is not None
 
     def _handed_over(self, T_world_tcp: Array) -> m.CollisionObject | None:
         """Return what another arm holds between the fingers of this one, in the tool frame."""
@@ -219,7 +233,7 @@ class PerceivedScene:
             self._object(f"contained_{k + 1}", "contained", thing, _pose(Track("", thing.position, 0, 0.0, thing)))
             for k, thing in enumerate(unsorted[:MAX_UNSORTED])
         ]
-        held = [self._held] if self._held is not None else []
+        held = [self.held] if self.held is not None else []
         settled = self._tracks.settled()
         return m.PlanningScene(
             header=m.Header(stamp=self._stamp, frame_id="world"),
