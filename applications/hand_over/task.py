@@ -48,9 +48,11 @@ class Receiver(Receiving):
         assert isinstance(view, HandoverView)
         partner = view.partner
         if partner is not None and partner.status is not None and partner.status.state == "DONE":
-            counted = self.status.done >= partner.status.total
-            if self._counting.elapsed("the giver is done", view.now) >= COUNTED or counted:
+            missing = partner.status.total - self.status.done
+            if missing <= 0:
                 self.finish(view)
+            elif self._counting.elapsed("the giver is done", view.now) >= COUNTED:
+                self.end("DONE", f"{missing} of {partner.status.total} objects are not seen in the container")
         elif not self.ends_with(partner, view):
             self.status.message = f"{WAITS} {self.p.partner} offers an object"
 

@@ -143,6 +143,11 @@ class Handover(Handling):
 class Giving(Handover):
     """Brings what it holds to the meeting place and gives it to the other arm."""
 
+    def destination(self, thing: m.CollisionObject, view: View) -> m.Pose | None:
+        """Return the meeting place."""
+        x, y, z = self.p.meeting
+        return m.Pose(position=m.Vector3(x=x, y=y, z=z))
+
     def put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View, width: float | None) -> list[Stage]:
         """Carry the object to the meeting place, the tool towards the other arm."""
         ends = list(self._offers(pose_to_matrix(held)))
@@ -188,6 +193,11 @@ class Giving(Handover):
 
 class Receiving(Handover):
     """Takes what the other arm offers, and puts it down where `destination` says."""
+
+    def put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View, width: float | None) -> list[Stage]:
+        """Put it there also if a restart of the planning scene has lost what it is."""
+        known = thing if thing.kind else thing.model_copy(update={"kind": thing.id})
+        return super().put(known, held, cycle, view, width)
 
     def decide(self, view: View) -> None:
         """Take what is offered; carry it away once the other arm has withdrawn."""

@@ -6,11 +6,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from applications.hand_over.task import Config, Giver, Receiver
 from applications.hand_over.topics import HANDOVER_STATUS
 from common import messages as m
 from common import topics
 from common.arms import arms_topic
-from common.config import Cell, load_cell
+from common.config import Cell, load_cell, service_config
 from common.robot.model import RobotModel
 from common.tasks.handover import Receiving, _backward
 from common.tasks.stages import Move
@@ -138,3 +139,25 @@ def test_stop_while_a_part_changes_hands_drops_nothing_and_only_a_start_continue
 
     outcome = Simulation(cell(), 1, visit=visit).run()
     assert (outcome.state, outcome.done, outcome.total, outcome.crashes) == ("DONE", 1, 1, []), outcome
+
+
+@pytest.mark.parametrize(("arm", "task"), [("left", Giver), ("right", Receiver)])
+def test_each_arm_has_a_complete_task(arm: str, task: type[Giver | Receiver]) -> None:
+    config = service_config(cell(), f"{arm}_hander", Config)
+    assert task(config, m.TaskStatus(), arm).status.state == "IDLE"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["close", "across"])
+def test_part_gets_into_the_box_although_a_restart_forgot_what_the_receiver_holds(stage: str) -> None:
+    async def visit(bus: Bus) -> None:
+        watch = Watch(bus)
+        await watch.until("right", stage)
+        while "right" not in watch.holding():
+            await watch.grippers["right"].next()
+        simulation.kill("right_scene_manager")
+
+    simulation = Simulation(cell(), 1, visit=visit)
+    outcome = simulation.run()
+    assert (outcome.state, outcome.done, outcome.total, outcome.crashes) == ("DONE", 1, 1, []), outcome
+    assert outcome.restarts
