@@ -75,7 +75,7 @@ class Steps:
             self._do(step.placing(number))
         self._patterns.pop()
 
-    def _do_kind(self, kind: str, **fields: Any) -> None:
+    def _do_kind(self, kind: str, /, **fields: Any) -> None:
         self._do(check(STEPS[kind], {"id": kind, **fields}))
 
     def _do(self, step: BaseStep) -> None:
