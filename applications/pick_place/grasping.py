@@ -71,7 +71,7 @@ class Config(TaskConfig):
     )
     max_retries: Tunable[int] = Field(3, ge=0, le=100, description="grasps of one place that may close on nothing")
     max_failures: Tunable[int] = Field(
-        10, ge=1, le=1000, description="failures in a row after which the task gives up"
+        10, ge=1, le=1000, description="failures, or grasps of nothing, in a row after which the task gives up"
     )
     moved: Tunable[float] = Field(
         0.005, gt=0, le=0.05, description="an object that is further from where it was has moved [m]"

@@ -50,6 +50,7 @@ class PickPlace(Task[PickPlaceView]):
         self._viewing, self._hidden = ViewingPoses(config), DwellTimer()
         self._counter = ObjectCounter(config)
         self._last_failure = "", ""  # id of the object that the gripper approached, and the reason without numbers
+        self._missed = 0  # grasps in a row that closed on nothing
 
     # --- what to do next -------------------------------------------------------------------------------------
 
@@ -176,7 +177,7 @@ class PickPlace(Task[PickPlaceView]):
         """Try all viewing poses again: the obstacle may be gone."""
         self._viewing.found()
         self._hidden.reset()
-        self._counter.expected = 0
+        self._counter.expected = self._missed = 0
 
     @property
     def memory(self) -> ReleasePositions:
@@ -193,18 +194,26 @@ class PickPlace(Task[PickPlaceView]):
         pick = _pick_of(stage)
         if stage.name == "release" and pick is not None:
             self.status.done += 1
+            self._missed = 0
             self._counter.released = True
             if self._around.on_hand:
                 self.images_after = view.now
             self._choice.released(pick, view)
 
     def missed(self, stage: Grip, view: PickPlaceView) -> None:
-        """Handle a grasp that closed on nothing or on an unexpected width: open, move up and look again."""
+        """Handle a grasp that closed on nothing or on an unexpected width: open, move up and look again.
+
+        After too many in a row the gripper is taken for broken, and the task ends.
+        """
         pick = _pick_of(stage)
         assert pick is not None
         self.status.retries += 1
+        self._missed += 1
         x, y, _ = pick.target.position
         self.status.message = f"{stage.problem} at ({x:.3f}, {y:.3f})"
+        if self._missed >= self.failure_limit:
+            self.end("ERROR", f"{self.status.message}; that makes {self._missed} grasps in a row")
+            return
         self._choice.missed(pick.target, view.released(), stage.problem)
         self._drop(view)
 

@@ -176,6 +176,18 @@ def test_failed_grasp_is_released_and_retried_until_it_is_abandoned(kind: str, m
     assert cell.task.status.skipped[0].reason == f"{message} 3 times"
 
 
+def test_many_grasps_in_a_row_that_close_on_nothing_end_the_task_until_it_is_started_again() -> None:
+    cell = CellDouble(SEVEN, max_failures=5)
+    cell.slips = 5
+    cell.until("ERROR")
+    message = cell.task.status.message
+    assert message.startswith("the fingers closed on nothing at (")
+    assert message.endswith("; that makes 5 grasps in a row")
+    cell.command("start")
+    cell.until("DONE")
+    assert cell.contained == 7
+
+
 def test_wrong_object_found_in_the_gripper_is_released() -> None:
     cell = CellDouble(ONE)
     cell.outliers = 1
