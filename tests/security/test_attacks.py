@@ -36,6 +36,7 @@ pytestmark = [pytest.mark.cell, pytest.mark.slow, pytest.mark.timeout(300)]
 
 TRUTH = {"panda/scene_balls", "panda/scene_objects"}
 MARK = b"attack"
+IMAGE = 500_000  # [bytes] pixels only
 
 
 @pytest.fixture(scope="module")
@@ -377,11 +378,11 @@ def test_no_secret_is_in_files_output_or_command_lines_of_a_cell(secured: Secure
     assert read_tokens(secured.folder, "panda").keys() == set(ROLES)
     assert len(secrets) > 50
     with Recording(secured.recording) as recording:
-        written = [sample.payload for sample in recording.samples()]
+        written = {sample.payload for sample in recording.samples() if len(sample.payload) < IMAGE}
     files = [path for path in secured.cell.folder.rglob("*") if path.is_file()]
     assert len(files) >= 3
-    written += [path.read_bytes() for path in files]
-    written += [listed.stdout.encode(), listed.stderr.encode()]
+    written |= {path.read_bytes() for path in files if path.suffix != ".mcap"}
+    text = b"\0".join([*written, listed.stdout.encode(), listed.stderr.encode()])
     for secret in secrets:
-        assert not any(secret in text for text in written)
+        assert secret not in text
     assert not any(TOKEN in command for command in commands)
