@@ -38,16 +38,19 @@ up: setup  ## start the cell and stay until Ctrl-C
 # Tests start hundreds of processes, which would all compile the sources again without a bytecode cache.
 test test-all campaign: export PYTHONDONTWRITEBYTECODE =
 
+# Four workers also on two cores: a third of the time, tests wait for processes.
+WORKERS := -n 4 --dist loadfile --no-loadscope-reorder
+
 test: setup
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -q $(WORKERS)
 
 test-all: setup  ## `make test`, and what takes long
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not container and not alone and not browser and not campaign"
+	$(BIN)/python -m pytest -q $(WORKERS) -m "not container and not alone and not browser and not campaign"
 	$(BIN)/python -m pytest -q -m "browser and not container and not alone and not campaign"  # cells with Chromium: one at a time
 	$(BIN)/python -m pytest -q -m "alone and not campaign" || [ $$? = 5 ]  # exit code 5: no driver is installed
 
 campaign: setup  ## tests that repeat over hundreds of seeds, or for minutes
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "campaign and not alone"
+	$(BIN)/python -m pytest -q $(WORKERS) -m "campaign and not alone"
 	$(BIN)/python -m pytest -q -m "campaign and alone"
 
 two-arms: setup  ## two arms cross over one table: contacts by an independent judge, makespan, time of proofs; half an hour

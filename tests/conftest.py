@@ -43,6 +43,6 @@ def pytest_unconfigure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with files of long tests, end with tests/common: two workers get the files in this order."""
+    """Start with files of long tests, end with tests/common: the workers get the files in this order."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: (item.path not in slow, item.nodeid.startswith("tests/common/")))
