@@ -14,7 +14,7 @@ from pathlib import Path
 from common.transport.endpoint import BASE_PORT
 
 DOMAINS = range(60, 233)
-_given: deque[int] = deque(maxlen=len(DOMAINS) // 4)  # recently returned, perhaps without a listener yet
+_given: deque[int] = deque(maxlen=len(DOMAINS))  # returned, the latest last
 _locks: dict[int, int] = {}  # lock descriptors by domain
 
 
@@ -28,7 +28,8 @@ def free_domain() -> int:
     """
     share = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     domains = DOMAINS[share :: int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))]
-    choices = [number for number in domains if number not in _given]
+    recent = [*_given][-(len(domains) // 2):]  # perhaps without a listener yet
+    choices = [number for number in domains if number not in recent]
     random.shuffle(choices)
     for number in choices:
         with socket.socket() as probe:

@@ -52,6 +52,7 @@ async def end_state(bus: Bus) -> tuple[list[float], float, dict[str, object]]:
     return list(state.position), (gripper.latest or await gripper.next()).width, signals
 
 
+@pytest.mark.slow
 async def test_exported_script_ends_in_the_same_state_as_the_program(tmp_path: Path) -> None:
     program = tmp_path / "both.yaml"
     program.write_text(BOTH.format(cell=CELL))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import yaml
 
 from cli.main import app
@@ -66,6 +67,7 @@ def test_images_of_a_resting_arm_in_new_poses_are_collected_and_continued(tmp_pa
     assert saved["robot"] == "panda" and np.allclose(saved["pictures"]["view_001.png"], POSES[1], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_camera_at_the_hand_is_calibrated_from_a_folder(tmp_path, capsys, rejection):
     collector = HandEyeCollector(tmp_path / "views", ROBOT, "panda", BOARD)
     for n, q in enumerate(POSES):
@@ -99,6 +101,7 @@ def test_camera_at_the_hand_is_calibrated_from_a_folder(tmp_path, capsys, reject
     assert "the joints are in degrees: converted to rad, the residual is 0.0" in line
 
 
+@pytest.mark.slow
 def test_views_are_collected_from_a_running_cell(tmp_path, monkeypatch):
     shots = {f"s{n}.png": POSES[n].tolist() for n in range(3)}
     for n, name in enumerate(shots):

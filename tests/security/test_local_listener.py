@@ -66,6 +66,7 @@ def listens(endpoint: str) -> bool:
     return True
 
 
+@pytest.mark.slow
 async def test_local_client_bypasses_the_gate_and_has_the_rights_of_its_certificate(router: SecuredRouter) -> None:
     session, _ = await router.connect(near=True)
     assert session.connected and not router.uses_gate and len(session._session.info.links()) == len(LINKS)

@@ -199,6 +199,7 @@ steps:
 """
 
 
+@pytest.mark.slow
 def test_objects_that_a_camera_sees_are_picked_and_placed_in_a_pattern(tmp_path: Path) -> None:
     (tmp_path / "sort.yaml").write_text(SORT)
     truth: list[m.WorldObjects] = []

@@ -148,7 +148,7 @@ def test_each_arm_has_a_complete_task(arm: str, task: type[Giver | Receiver]) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["close", "across"])
+@pytest.mark.parametrize("stage", [pytest.param("close", marks=pytest.mark.campaign), "across"])
 def test_part_gets_into_the_box_although_a_restart_forgot_what_the_receiver_holds(stage: str) -> None:
     async def visit(bus: Bus) -> None:
         watch = Watch(bus)
