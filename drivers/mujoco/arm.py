@@ -165,7 +165,7 @@ FINGER_ENCODER = 5  # decimals of measured [m], [m/s]
 STILL = 2e-3  # [m/s] threshold of standstill
 SHORT = 3e-3  # [m] tolerance of the commanded width
 STALLS = 0.05  # [s] of standstill short of the target: they press on something
-SLIPS = 0.03  # [s] of motion: they no longer press
+SLIPS, SLID = 0.03, 1e-3  # [s] and [m] of motion: they no longer press; less is a push against what they hold
 
 
 class PhysicsFingers:
@@ -179,6 +179,7 @@ class PhysicsFingers:
         self._placed = False  # they press since before a restart
         self._still_since = math.inf  # [s] start of standstill short of the target
         self._moving_since = math.inf
+        self._rest = config.max_width  # width at the latest standstill [m]
         self._holds = False
         self._width, self._rate, self._force = config.max_width, 0.0, 0.0
         self._moves = False
@@ -236,8 +237,10 @@ class PhysicsFingers:
         blocked = self._placed or self._profile.read(now).width < self._width - SHORT / 2
         self._still_since = min(self._still_since, now) if is_still and is_short and blocked else math.inf
         self._moving_since = math.inf if is_still else min(self._moving_since, now)
+        self._rest = self._width if is_still else self._rest
         if self._holds:
-            self._holds = is_short and now - self._moving_since < SLIPS
+            slid = now - self._moving_since >= SLIPS and abs(self._width - self._rest) > SLID
+            self._holds = is_short and not slid
         else:
             self._holds = now - self._still_since >= STALLS
         self._moves = not self._holds and (self._profile.read(now).moving or not is_still

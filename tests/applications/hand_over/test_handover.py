@@ -54,7 +54,10 @@ class Watch:
 
 
 @pytest.mark.slow
-def test_part_goes_from_hand_to_hand_into_the_box_and_the_arms_keep_their_clearance() -> None:
+@pytest.mark.parametrize("simulator", ["kinematic", "mujoco"])
+def test_part_goes_from_hand_to_hand_into_the_box_and_the_arms_keep_their_clearance(simulator: str) -> None:
+    if simulator == "mujoco":
+        pytest.importorskip("mujoco", reason="make setup EXTRAS=physics")
     states: list[tuple[np.ndarray, ...]] = []
     changes: list[list[str]] = [[]]
 
@@ -67,7 +70,7 @@ def test_part_goes_from_hand_to_hand_into_the_box_and_the_arms_keep_their_cleara
             if watch.holding() != changes[-1]:
                 changes.append(watch.holding())
 
-    config = cell()
+    config = cell(f"world.simulator={simulator}")
     outcome = Simulation(config, 1, visit=visit).run()
     assert (outcome.state, outcome.done, outcome.total, outcome.crashes) == ("DONE", 1, 1, []), outcome
     assert changes == [[], ["left"], ["left", "right"], ["right"], []]
