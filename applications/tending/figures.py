@@ -19,6 +19,6 @@ class TendingFigures(application.Figures):
 
     def achieved(self, truth: WorldObjects) -> str:
         """Return the number of parts in slots of the pallet."""
-        given = self.parameters.get("pallet")
-        wrong = misplaced(truth, PALLET if given is None else Pattern.model_validate(given))
+        default = PALLET.model_dump(exclude_unset=True)
+        wrong = misplaced(truth, Pattern.model_validate({**default, **self.parameters.get("pallet", {})}))
         return f"{len(truth.objects) - len(wrong)} of {len(truth.objects)} parts on the pallet"

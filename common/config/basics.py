@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import NoneType, UnionType
 from typing import Annotated, Any, ClassVar, TypeVar, Union, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from common.errors import ConfigError
 from common.remapping import is_key
@@ -56,6 +56,20 @@ class Parameters(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, defer_build=True)
 
     ALL_ARMS: ClassVar[bool] = False  # whether a service with a robot may serve all arms of a cell with several
+
+    @model_validator(mode="before")
+    @classmethod
+    def _keep_what_a_default_sets(cls, values: Any) -> Any:
+        """Let a group that has a default, and is given without all that it requires, name only what differs from it."""
+        if not isinstance(values, Mapping):
+            return values
+        merged = dict(values)
+        for name, field in cls.model_fields.items():
+            default, given = field.default, values.get(name)
+            if isinstance(default, BaseModel) and isinstance(given, Mapping) and any(
+                    each.is_required() and part not in given for part, each in type(default).model_fields.items()):
+                merged[name] = {**default.model_dump(exclude_unset=True), **given}
+        return merged
 
     def require_usable(self) -> None:
         """Check what the values name on this host, such as files; called before any process starts, so it is quick.

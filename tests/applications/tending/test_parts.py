@@ -12,7 +12,7 @@ from applications.tending.parts import Options, find_misplaced, generate
 from applications.tending.task import PALLET, Config, Part, Tending
 from applications.tending.topics import TendingStatus
 from common import messages as m
-from common.config import Surroundings, World, load_cell
+from common.config import Surroundings, World, load_cell, service_config
 from common.errors import ConfigError
 from common.tasks.palletizing import slots
 from common.tasks.stages import View
@@ -106,3 +106,13 @@ def test_summary_counts_parts_in_slots_of_their_own_by_ground_truth() -> None:
         m.WorldObject(id=name, shape="box", state="table", pose=m.Pose(position=at))
         for name, at in (("a", first), ("b", second), ("c", m.Vector3(x=0.3, y=-0.3)))])
     assert TendingFigures().achieved(truth) == "2 of 3 parts on the pallet"
+    figures = TendingFigures()
+    figures.parameters = {"pallet": {"position": [0.45, -0.25, 0.0]}}
+    assert figures.achieved(truth) == "0 of 3 parts on the pallet"
+
+
+def test_single_value_of_the_pallet_keeps_the_others() -> None:
+    config = service_config(load_cell("tending", ["services.tender.pallet.rows=2"]), "tender", Config)
+    assert config.pallet == PALLET.model_copy(update={"rows": 2})
+    with pytest.raises(ConfigError, match=r"services\.tender\.pallet\.rows: 0 must be greater"):
+        service_config(load_cell("tending", ["services.tender.pallet.rows=0"]), "tender", Config)

@@ -75,6 +75,13 @@ async def test_keys_of_arms_are_below_their_names_and_have_one_owner() -> None:
     assert (arm_of("left/tf", cell.robots), arm_of("camera/image_raw", cell.robots)) == ("left", "")
 
 
+def test_value_of_a_service_of_each_arm_is_set_for_one_arm_or_all() -> None:
+    cell = load_cell("handover", ["services.hander.left.meeting_speed=0.05", "services.hander.back_off=0.15"])
+    given = {arm: cell.services[f"{arm}_hander"].parameters for arm in cell.robots}
+    assert {arm: each.get("meeting_speed") for arm, each in given.items()} == {"left": 0.05, "right": None}
+    assert {each["back_off"] for each in given.values()} == {0.15}
+
+
 @pytest.mark.parametrize(("override", "error"), [
     ("robots={left: panda, right: panda}", r"robots\.right\.base_position: .* is 0\.000 m from the base of left"),
     ("robots={left: pandas}", "unknown robot 'pandas' .did you mean 'panda'"),
