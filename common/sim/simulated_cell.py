@@ -198,7 +198,7 @@ class SimulatedCell:
 
     def conveyors(self, header: Header, stopped: int) -> ConveyorState | None:
         """Return the state of all belts if it is to be published; `stopped` is the time of a STOP, or 0 [ns]."""
-        if self._first is not None:
+        if self.suspended or self._first is not None:
             return None
         self._belts.apply_stop(stopped)
         return self._belts.changed(header)
