@@ -6,8 +6,6 @@ from common import messages as m
 from common.tasks.handover import WAITS, Giving, HandoverConfig, HandoverView, Receiving
 from common.tasks.stages import DwellTimer, View
 
-COUNTED = 5.0  # [s] for images to show in the container what was put there
-
 
 class Config(HandoverConfig):
     """Parameters of the task of one arm: of the giver or of the receiver."""
@@ -51,7 +49,7 @@ class Receiver(Receiving):
             missing = partner.status.total - self.status.done
             if missing <= 0:
                 self.finish(view)
-            elif self._counting.elapsed("the giver is done", view.now) >= COUNTED:
+            elif self._counting.elapsed("the giver is done", view.now) >= self.p.give_up:
                 self.end("DONE", f"{missing} of {partner.status.total} objects are not seen in the container")
         elif not self.ends_with(partner, view):
             self.status.message = f"{WAITS} {self.p.partner} offers an object"
