@@ -216,7 +216,7 @@ class ProgramTask(Task[View]):
         elif self.status.message == self._halted:
             self.status.message = ""
         self._halted = self.status.halted
-        self.status.total = max(self.status.total, self.status.done)
+        self.status.total = max(self.status.total, self.status.done + bool(self.status.step))
 
     # --- steps ----------------------------------------------------------------------------------------------------
 

@@ -181,8 +181,9 @@ def test_functions_of_the_user_decide_time_out_and_fail(tmp_path: Path) -> None:
             steps.append(status.step)
             return status.state == "ERROR"
 
-        assert (await operator.until(note)).message == (
-            "call.yaml:6: wrong: own_functions_of_a_test:wrong raised ValueError: no part")
+        failed = await operator.until(note)
+        assert failed.message == "call.yaml:6: wrong: own_functions_of_a_test:wrong raised ValueError: no part"
+        assert failed.total == failed.done + 1, "the step that failed counts"
 
     simulate(tmp_path, visit, state="ERROR")
     assert list(dict.fromkeys(steps)) == ["fast", "odd", "slow", "failed", "wrong"]
