@@ -230,9 +230,10 @@ def _for_each_arm(
     for parts, value in overrides:
         each = [f"{arm}_{parts[1]}" for arm in arms] if parts[0] == "services" and len(parts) > 2 else []
         if each and parts[1] not in services and all(name in services for name in each):
-            own = len(parts) > 3 and parts[2] in arms  # as in the cell file, a parameter of one arm
-            yield from [([parts[0], f"{parts[2]}_{parts[1]}", *parts[3:]], value)] if own else (
-                ([parts[0], name, *parts[2:]], value) for name in each)
+            if len(parts) > 3 and parts[2] in arms:  # as in the cell file, a parameter of one arm
+                yield [parts[0], f"{parts[2]}_{parts[1]}", *parts[3:]], value
+            else:
+                yield from (([parts[0], name, *parts[2:]], value) for name in each)
         else:
             yield parts, value
 
