@@ -6,9 +6,16 @@ from typing import ClassVar
 
 from applications.tending.parts import misplaced
 from applications.tending.task import PALLET
+from common.config import Parameters
 from common.messages import WorldObjects
 from common.tasks.palletizing import Pattern
 from recording.report import application
+
+
+class Pallet(Parameters):
+    """The pattern as the task reads it."""
+
+    pallet: Pattern = PALLET
 
 
 class TendingFigures(application.Figures):
@@ -19,6 +26,6 @@ class TendingFigures(application.Figures):
 
     def achieved(self, truth: WorldObjects) -> str:
         """Return the number of parts in slots of the pallet."""
-        default = PALLET.model_dump(exclude_unset=True)
-        wrong = misplaced(truth, Pattern.model_validate({**default, **self.parameters.get("pallet", {})}))
+        given = {"pallet": self.parameters["pallet"]} if "pallet" in self.parameters else {}
+        wrong = misplaced(truth, Pallet.model_validate(given).pallet)
         return f"{len(truth.objects) - len(wrong)} of {len(truth.objects)} parts on the pallet"

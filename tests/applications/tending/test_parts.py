@@ -109,6 +109,8 @@ def test_summary_counts_parts_in_slots_of_their_own_by_ground_truth() -> None:
     figures = TendingFigures()
     figures.parameters = {"pallet": {"position": [0.45, -0.25, 0.0]}}
     assert figures.achieved(truth) == "0 of 3 parts on the pallet"
+    figures.parameters = {"pallet": {"item": PALLET.item, "columns": 1}}  # complete: around the origin, as for the task
+    assert figures.achieved(truth) == "0 of 3 parts on the pallet"
 
 
 def test_single_value_of_the_pallet_keeps_the_others() -> None:
