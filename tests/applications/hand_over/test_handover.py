@@ -36,6 +36,7 @@ class Watch:
         self.joints = {arm: bus.reader(arms_topic(topics.JOINT_STATES, arm)) for arm in ARMS}
         self.grippers = {arm: bus.reader(arms_topic(topics.GRIPPER_STATE, arm)) for arm in ARMS}
         self.status = {arm: bus.reader(arms_topic(HANDOVER_STATUS, arm)) for arm in ARMS}
+        self.motions = {arm: bus.reader(arms_topic(topics.MOTION_STATUS, arm)) for arm in ARMS}
         self.truth = bus.reader(topics.SCENE_OBJECTS)
 
     def positions(self) -> tuple[np.ndarray, ...]:
@@ -133,9 +134,14 @@ def test_stop_while_a_part_changes_hands_drops_nothing_and_only_a_start_continue
         await watch.until(arm, stage)
         await asyncio.sleep(0.1)
         await bus.client(topics.MOTION_STOP).call(m.StopRequest(reason="test"))
-        await asyncio.sleep(1.0)
+        for motion in watch.motions.values():
+            while not (status := motion.latest or await motion.next()).stopped or status.state == "active":
+                await motion.next()
+        for gripper in watch.grippers.values():  # fingers finish what they have begun
+            while (gripper.latest or await gripper.next()).moving:
+                await gripper.next()
         before, held = watch.positions(), watch.holding()
-        await asyncio.sleep(5.0)
+        await asyncio.sleep(5.0)  # virtual: nothing moves meanwhile
         assert np.abs(np.subtract(watch.positions(), before)).max() < 1e-6
         assert watch.holding() == held and held and watch.height() == pytest.approx(0.45, abs=0.02)
         await bus.client(topics.TASK_COMMAND).call(m.TaskCommand(command="start"))
