@@ -48,7 +48,7 @@ class Clock:
             raise ValueError(f"speed: {speed:g} is not within {MIN_SPEED:g} to {MAX_SPEED:g}")
         self.speed = speed
         # From here on by the boot clock: a step of the system clock must not move the robot.
-        self._offset_ns = time_source.wall_ns() - time_source.host_ns() if booted_ns is None else booted_ns
+        self._offset_ns = time_source.booted_ns() if booted_ns is None else booted_ns
         self.epoch_ns = self._wall_ns() if epoch_ns is None else epoch_ns
 
     @classmethod
@@ -106,7 +106,7 @@ def _booted(environ: Mapping[str, str]) -> int | None:
         path = Path(folder) / f"clock-{BOOT_ID.read_text().strip()}"
         if not path.exists():
             own = path.with_suffix(f".{os.getpid()}-{time_source.new_id()}")
-            own.write_text(str(time_source.wall_ns() - time_source.host_ns()))
+            own.write_text(str(time_source.booted_ns()))
             with contextlib.suppress(FileExistsError):  # the first process decides for all
                 os.link(own, path)
             own.unlink()

@@ -14,6 +14,8 @@ from typing import Protocol
 # Without such a clock (macOS) the monotonic one is the same in all processes as well.
 _HOST_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
+_READINGS, _GOOD_READING_NS = 10, 10_000  # of two clocks at one time
+
 
 class TimeSource(Protocol):
     """A monotonic clock, a boot clock, a wall clock, and ids."""
@@ -66,6 +68,20 @@ def host_ns() -> int:
 def wall_ns() -> int:
     """Return the time since the Unix epoch [ns]; it may be set back."""
     return _Current.source.wall_ns()
+
+
+def booted_ns() -> int:
+    """Return the Unix time at which this host's boot clock was at 0 [ns], by the system clock as it is set now."""
+    best, error = 0, None
+    for _ in range(_READINGS):
+        before = host_ns()
+        wall = wall_ns()
+        took = host_ns() - before
+        if error is None or took < error:
+            best, error = wall - before - took // 2, took
+        if error < _GOOD_READING_NS:
+            break  # else another process had the processor between the readings
+    return best
 
 
 def new_id(count: int = 4) -> str:

@@ -50,6 +50,19 @@ def test_process_restarted_after_a_step_of_the_system_clock_agrees_with_the_othe
     assert again.now_ns() == first.now_ns() == supervisor.now_ns() == supervisor.epoch_ns + int(2e9 * speed)
 
 
+def test_process_that_loses_its_processor_while_it_reads_the_clocks_agrees_with_the_others(host, monkeypatch):
+    first, losses = Clock(), iter([4_000_000, 4_000_000, 0, 0])
+
+    def lose_processor():
+        wall = host.wall
+        host.pass_time(next(losses))
+        return wall
+
+    monkeypatch.setattr(host, "wall_ns", lose_processor)
+    second = Clock(epoch_ns=first.epoch_ns)
+    assert second.now_ns() == first.now_ns()
+
+
 def test_processes_started_before_and_after_a_sleep_of_the_host_agree(host):
     supervisor = Clock()
     host.pass_time(HOUR)
