@@ -42,6 +42,7 @@ from lab.arm_distance import ArmDistance
 from lab.doubles import is_double
 from lab.motion_invariants import ONCE, Checks, MotionInvariants
 from lab.processes import RequestLog
+from recording.report.application import figures_of
 
 Position = tuple[float, float, float]  # x, y, z [m]
 
@@ -70,6 +71,8 @@ class WorldInvariants:
         application = find_application(cell.application)
         self._hands = max(len(cell.robots), 1)
         self._fills, self._truth_check = application.fills_containers, application.truth_check
+        self._figures = figures_of(application)()
+        self._figures.parameters = cell.task_parameters
         self._physics = cell.world.simulator != "kinematic"  # objects are pushed, and roll
         self._belts = [*cell.world.conveyors.values()]  # carry objects, also off their end
         self._newest = b""  # encoded ground truth
@@ -123,9 +126,13 @@ class WorldInvariants:
             contained = sum(container in self._destinations for container in self._containers.values())
             if checks.fails(done == contained, COUNTED):
                 checks.add_violation(COUNTED, f"the task reports {done}, the ground truth has {contained}")
-        if state == "DONE" and self._truth_check is not None and self._newest:
-            problem = self._truth_check(decode(WorldObjects, self._newest))
-            if checks.fails(not problem, ACCEPTED):
+        if state == "DONE" and self._newest:
+            truth = decode(WorldObjects, self._newest)
+            problem = self._truth_check(truth) if self._truth_check is not None else ""
+            placed = self._figures.in_place(truth)
+            if placed is not None and (missing := [each.id for each in truth.objects if each not in placed]):
+                problem = f"missing among the {self._figures.IN_PLACE}: {', '.join(missing)}"
+            if (placed is not None or self._truth_check is not None) and checks.fails(not problem, ACCEPTED):
                 checks.add_violation(ACCEPTED, problem)
 
 

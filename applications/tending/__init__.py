@@ -7,5 +7,4 @@ APPLICATION = Application(
     task="tender",
     grasps=True,
     figures="applications.tending.figures:TendingFigures",
-    truth_check="applications.tending.parts:find_misplaced",
 )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from applications.tending.parts import misplaced
 from applications.tending.task import PALLET
 from common.config import Parameters
-from common.messages import WorldObjects
-from common.tasks.palletizing import Pattern
+from common.messages import WorldObject, WorldObjects
+from common.tasks.palletizing import Pattern, slot_at, slots
+from common.tasks.stages import place_of
 from recording.report import application
 
 
@@ -21,11 +21,14 @@ class Pallet(Parameters):
 class TendingFigures(application.Figures):
     """Figures of every run."""
 
-    COUNTED = "on the pallet"
+    COUNTED, IN_PLACE = "on the pallet", "parts on the pallet"
     STATE_COLORS: ClassVar = {"GRASPING": "#2f7ed8", "PLACING": "#17a398", "HOMING": "#8d6cc2", "MACHINING": "#e0a030"}
 
-    def achieved(self, truth: WorldObjects) -> str:
-        """Return the number of parts in slots of the pallet."""
+    def in_place(self, truth: WorldObjects) -> list[WorldObject]:
+        """Return the parts with a slot of the pallet for themselves."""
         given = {"pallet": self.parameters["pallet"]} if "pallet" in self.parameters else {}
-        wrong = misplaced(truth, Pallet.model_validate(given).pallet)
-        return f"{len(truth.objects) - len(wrong)} of {len(truth.objects)} parts on the pallet"
+        pallet = Pallet.model_validate(given).pallet
+        every = slots(pallet)
+        taken = [slot_at(pallet, place_of(part.pose), every) for part in truth.objects]
+        return [part for part, slot in zip(truth.objects, taken, strict=True)
+                if slot is not None and part.state == "table" and sum(slot == other for other in taken) == 1]

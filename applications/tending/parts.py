@@ -1,4 +1,4 @@
-"""Parts of the simulated world, drawn by the seed, and the check of their end by ground truth.
+"""Parts of the simulated world, drawn by the seed.
 
     generator: {module: applications.tending.parts, count: 4}
 """
@@ -13,9 +13,6 @@ from pydantic import Field
 from applications.tending.task import PALLET
 from common.config import ObjectConfig, Parameters, World
 from common.errors import ConfigError
-from common.messages import WorldObjects
-from common.tasks.palletizing import Pattern, slot_at, slots
-from common.tasks.stages import place_of
 
 ATTEMPTS = 200
 
@@ -49,17 +46,3 @@ def generate(world: World, options: Options, seed: int) -> list[ObjectConfig]:
                                      yaw=float(rng.uniform(-1.5, 1.5)), color=(0.9, 0.1, 0.1), mass=0.15)
                         for n, (x, y) in enumerate(places, 1)]
     raise ConfigError("world.generator.count", options.count, f"parts do not fit {options.separation:g} m apart")
-
-
-def misplaced(truth: WorldObjects, pallet: Pattern) -> list[str]:
-    """Return the ids of parts without a slot of their own on a pallet, by ground truth: for evaluation only."""
-    every = slots(pallet)
-    taken = [slot_at(pallet, place_of(part.pose), every) for part in truth.objects]
-    return [part.id for part, slot in zip(truth.objects, taken, strict=True)
-            if slot is None or part.state != "table" or sum(slot == other for other in taken) > 1]
-
-
-def find_misplaced(truth: WorldObjects) -> str:
-    """Return which parts are not in a slot of the default pallet, by ground truth: for evaluation only."""
-    wrong = misplaced(truth, PALLET)
-    return f"not in a slot of the pallet: {', '.join(wrong)}" if wrong else ""

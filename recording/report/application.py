@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from common.application import Application
-from common.messages import PoseArray, TaskStatus, WorldObjects
+from common.messages import PoseArray, TaskStatus, WorldObject, WorldObjects
 from common.topics import Topic
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ class Figures:
 
     COUNTED: ClassVar[str] = "done"  # label of what the task counts
     STATE_COLORS: ClassVar[Mapping[str, str]] = {}  # of task states in the timeline; the others get default colors
+    IN_PLACE: ClassVar[str] = "objects in place"  # label of what `in_place` returns
     TRUTH: ClassVar[Topic[PoseArray] | None] = None  # labelled positions, if world objects have no state
     parameters: Mapping[str, Any] = {}  # of the task in the cell file
 
@@ -69,9 +70,12 @@ class Figures:
         line = f"{summary['placed']} of {summary['targets']} {self.COUNTED}"
         return f"{line} (truth: {format_truth(summary['truth'])})" if summary["truth"] else line
 
-    def achieved(self, truth: WorldObjects) -> str:
-        """Return what was achieved by ground truth, in a few words; empty: where the objects are says it."""
-        return ""
+    def in_place(self, truth: WorldObjects) -> list[WorldObject] | None:
+        """Return the objects that are where the task puts them, by ground truth; None if containers say it.
+
+        `zencell simulate` expects all objects in place once the task is DONE.
+        """
+        return None
 
     def facts(self, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         """Return names and values for the head of a report."""

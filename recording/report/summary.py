@@ -182,8 +182,12 @@ class Summary:
     def as_dict(self) -> dict[str, Any]:
         """Return the content of the summary file."""
         rejected, truth, world = self._all_rejected(), self.truth.counted(), self.truth.world
-        if truth is not None and world is not None and (achieved := self.figures.achieved(world)):
-            truth["achieved"] = achieved
+        placed = self.figures.in_place(world) if world is not None else None
+        if truth is not None and world is not None and placed is not None:
+            for each in placed:
+                truth["on_table" if each.state == "table" else "elsewhere"] -= 1
+            truth |= {"in_place": len(placed),
+                      "achieved": f"{len(placed)} of {len(world.objects)} {self.figures.IN_PLACE}"}
         figures = self._before + self._now
         seconds = self._task_until - self._task_since if self._task_since is not None else 0.0
         return {

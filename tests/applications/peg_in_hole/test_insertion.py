@@ -79,4 +79,4 @@ def test_summary_counts_pegs_in_the_hole_by_ground_truth(z: float, state: str, c
     pose = m.Pose(position=m.Vector3(x=x, y=y, z=surface + z))
     peg = m.WorldObject(id="peg", shape="cylinder", state=state, pose=pose,
                         size=m.Vector3(x=0.02, y=0.02, z=0.05))
-    assert figures.achieved(m.WorldObjects(objects=[peg])) == f"{counted} of 1 pegs in the hole"
+    assert figures.in_place(m.WorldObjects(objects=[peg])) == [peg][:counted]

@@ -7,15 +7,18 @@ from itertools import combinations
 
 import pytest
 
-from applications.tending.figures import TendingFigures
-from applications.tending.parts import Options, find_misplaced, generate
+from applications.tending.parts import Options, generate
 from applications.tending.task import PALLET, Config, Part, Tending
 from applications.tending.topics import TendingStatus
 from common import messages as m
+from common.application import find_application
 from common.config import Surroundings, World, load_cell, service_config
 from common.errors import ConfigError
 from common.tasks.palletizing import slots
 from common.tasks.stages import View
+from common.transport.codec import encode
+from lab.invariants import ACCEPTED, Checks, WorldInvariants
+from recording.report.aggregator import RunAggregator
 
 CELL = load_cell("tending")
 HOME = list(CELL.robot.named_poses["home"])
@@ -88,29 +91,44 @@ def test_full_pallet_is_reported() -> None:
     assert not task.queue and task.status.message == "the pallet is full"
 
 
-@pytest.mark.parametrize(("places", "message"), [
-    ([slot.pose for slot in slots(PALLET)], ""),
-    ([slots(PALLET)[0].pose, slots(PALLET)[0].pose], "not in a slot of the pallet: p0, p1"),
-    ([slots(PALLET)[0].pose, RAW.pose], "not in a slot of the pallet: p1"),
+def truth_of(*places: m.Pose) -> m.WorldObjects:
+    return m.WorldObjects(objects=[
+        m.WorldObject(id=f"p{n}", shape="box", state="table", pose=pose) for n, pose in enumerate(places)])
+
+
+FIRST, SECOND = (slot.pose for slot in slots(PALLET)[:2])
+TWO_ROWS = slots(PALLET.model_copy(update={"rows": 2}))
+
+
+@pytest.mark.parametrize(("settings", "places", "missing"), [
+    ([], [slot.pose for slot in slots(PALLET)], ""),
+    ([], [FIRST, FIRST], "p0, p1"),
+    ([], [FIRST, RAW.pose], "p1"),
+    (["services.tender.pallet.rows=2"], [slot.pose for slot in TWO_ROWS], ""),
+    (["services.tender.pallet.rows=2"], [TWO_ROWS[0].pose, SECOND], "p1"),
 ])
-def test_truth_check_names_what_is_not_in_a_slot_of_its_own(places: list[m.Pose], message: str) -> None:
-    size = m.Vector3(x=0.05, y=0.04, z=0.03)
-    truth = m.WorldObjects(objects=[
-        m.WorldObject(id=f"p{n}", shape="box", pose=pose, size=size) for n, pose in enumerate(places)])
-    assert find_misplaced(truth) == message
+def test_end_is_checked_by_the_pallet_of_the_cell(settings: list[str], places: list[m.Pose], missing: str) -> None:
+    invariants = WorldInvariants(checks := Checks(lambda: 1.0), load_cell("tending", settings))
+    invariants.on_truth(encode(truth_of(*places)))
+    invariants.on_end(0, "DONE")
+    assert [line.rpartition(f"{ACCEPTED}: ")[2] for line in checks.broken] == (
+        [f"missing among the parts on the pallet: {missing}"] if missing else [])
 
 
 def test_summary_counts_parts_in_slots_of_their_own_by_ground_truth() -> None:
-    first, second = (slot.pose.position for slot in slots(PALLET)[:2])
-    truth = m.WorldObjects(objects=[
-        m.WorldObject(id=name, shape="box", state="table", pose=m.Pose(position=at))
-        for name, at in (("a", first), ("b", second), ("c", m.Vector3(x=0.3, y=-0.3)))])
-    assert TendingFigures().achieved(truth) == "2 of 3 parts on the pallet"
-    figures = TendingFigures()
-    figures.parameters = {"pallet": {"position": [0.45, -0.25, 0.0]}}
-    assert figures.achieved(truth) == "0 of 3 parts on the pallet"
-    figures.parameters = {"pallet": {"item": PALLET.item, "columns": 1}}  # complete: around the origin, as for the task
-    assert figures.achieved(truth) == "0 of 3 parts on the pallet"
+    truth = truth_of(FIRST, SECOND, RAW.pose)
+
+    def counted(**parameters: object) -> dict[str, object] | None:
+        aggregator = RunAggregator("tending", find_application("tending"), parameters=parameters)
+        aggregator.on("scene_objects", truth, 0.0, 0)
+        return aggregator.summary.as_dict()["truth"]
+
+    assert counted() == {"in_box": 0, "on_table": 1, "in_place": 2, "elsewhere": 0, "containers": {},
+                         "achieved": "2 of 3 parts on the pallet"}
+    one_column = {"item": PALLET.item, "columns": 1}  # complete: around the origin, as for the task
+    for pallet in ({"position": [0.45, -0.25, 0.0]}, one_column):
+        found = counted(pallet=pallet)
+        assert found and (found["on_table"], found["achieved"]) == (3, "0 of 3 parts on the pallet")
 
 
 def test_single_value_of_the_pallet_keeps_the_others() -> None:
