@@ -379,7 +379,7 @@ class Coordinator:
                 if arm.body.carried and other.body.carried:
                     return f"holds what {other.name} holds, too: open one of the grippers"
                 if arm.back.touch is None and other.back is not None and other.back.touch is not None:
-                    return self.move_back(other, for_arm, since, now)
+                    return self.move_back(other, arm, since, now)
         if not state.movable:
             return "must not be moved: it is stopped, has a fault, or an operator controls it"
         if arm.ticket is not None:

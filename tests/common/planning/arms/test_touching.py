@@ -101,7 +101,7 @@ def test_who_reached_in_moves_back_first_and_neither_does_while_both_hold() -> N
     meeting.rest("right", meeting.at)
     (retreat,) = coordinator.move_back(left, right, 0.0, 10.0)
     assert isinstance(retreat, Retreat)
-    assert (retreat.arm, retreat.may_touch) == ("right", ("box",))
+    assert (retreat.arm, retreat.may_touch, retreat.why) == ("right", ("box",), "out of the way of left")
     coordinator.carry("right", meeting.body("right", "taken"))
     coordinator.step(10.0)
     for arm, other in ((left, right), (right, left)):
