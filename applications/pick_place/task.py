@@ -125,7 +125,8 @@ class PickPlace(Task[PickPlaceView]):
             remark = "; ".join(filter(None, remarks))
             message = f"{left} objects are left that cannot be taken" if left else "the table looks empty"
             self.status.overlooked = f"{message}{':' if left else ', but'} {remark}"[:MOST] if remark else ""
-            self.status.message = self.status.overlooked or message
+            if min(view.stamps) > self.images_after:  # else the next attempt only waits for an image
+                self.status.message = self.status.overlooked or message
         self.status.state, self.status.stage, self.status.subject = "DONE" if done else "IDLE", "", ""
 
     def unseen(self, view: PickPlaceView) -> str:
@@ -162,9 +163,11 @@ class PickPlace(Task[PickPlaceView]):
         self.status.skipped = self._choice.rejections()
         stages = {self.status.stage, *(stage.name for stage in self.active_stages)}
         releases = "release" in stages or self.deferred_grip == "release"
-        looked = not self._around.on_hand or min(view.stamps) > self.images_after
-        moves_object = bool(stages & {"close", "lift", "across", "release"})
-        self._counter.update(view, self.status, releases=releases, counts_table=looked and not moves_object)
+        # A gripper that closed on nothing hides the object until it is away, or for good if the task ends there.
+        hides = {"open", "retreat"} if self._missed else set()
+        counts = not stages & ({"close", "lift", "across", "release"} | hides) and self.status.state != "ERROR"
+        counts = counts and min(view.stamps) > self.images_after
+        self._counter.update(view, self.status, releases=releases, counts_table=counts)
 
     def _waits(self, view: PickPlaceView) -> bool:
         """Return whether nothing runs and nothing prevents the next decision."""
