@@ -228,9 +228,11 @@ class GoalFollower:
         catching_up = max(0.0, 1 - goal.behind / BEHIND)
         if speed_scaling == 1.0:
             catching_up *= goal.rate_on_schedule(now)
+        step = min(max(now - goal.last, 0.0), longest)
+        if goal.time < 0.0 and not braking:  # it waits at rest: late cycles do not delay its start
+            goal.time, goal.pace.rate = min(now - step - goal.start_at, 0.0), speed_scaling * goal.share
         goal.time = goal.pace.advance(
-            goal.at, goal.time, 0.0 if braking else speed_scaling * goal.share * catching_up,
-            min(max(now - goal.last, 0.0), longest),
+            goal.at, goal.time, 0.0 if braking else speed_scaling * goal.share * catching_up, step,
             self._limits.braking if braking else RAMP_SHARE * self._limits.acceleration,
             JERK_SHARE * self._limits.jerks,
         )

@@ -47,3 +47,15 @@ def test_late_goal_catches_up_within_the_limits(duration: float, start_at: float
     passed = 2.0 * (10 * 0.9**3 - 15 * 0.9**4 + 6 * 0.9**5)  # [rad] at 90 % of its time
     lag = float(np.interp(passed, q[:, 0], times)) - (start_at or 100.0) - 0.9 * duration
     assert least <= lag <= most
+
+
+def test_late_cycles_before_the_start_do_not_delay_it() -> None:
+    q, now = np.zeros(2), 100.0
+    controller = TrajectoryController(LIMITS, q)
+    controller.update(now, q, 0 * q)
+    controller.accept("a", rest_to_rest(q, [2.0, -1.0], FASTEST / 1.15, 101), now, q, start_at=100.5)
+    for gap in [0.15, 0.02, 0.15, 0.15, *[PERIOD] * 10]:
+        now += gap
+        q, dq = controller.update(now, q, 0 * q)
+        assert now > 100.5 or not dq.any(), "it starts too early"
+    assert now - 100.5 - controller.status.path_time == pytest.approx(0.0, abs=2 * PERIOD)
