@@ -235,7 +235,7 @@ class Task(ExecutionMonitor[V]):
         stage, arm = (self.queue[0] if self.queue else None), running.stage
         if not (isinstance(stage, Grip) and stage.early and isinstance(arm, Move)) or self._opening or self._early:
             return
-        if stage.holds and self._held_up:
+        if stage.holds and self._held_up and not stage.lead:  # with a lead the object moves with the arm
             return
         assert view.motion is not None and view.gripper is not None
         motion = view.motion

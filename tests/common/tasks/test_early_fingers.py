@@ -15,13 +15,15 @@ from tests.common.tasks.engine_cell import CELL, THERE, Cell, stops
 SEEN = 0.05  # [m] wide
 
 
-def take() -> list[Stage]:
+def take(lead: float = 0.0) -> list[Stage]:
     return [Move("reach", "REACHING", goal=THERE),
-            Grip("close", "REACHING", width=0.0, holds=True, early=True, expected_width=SEEN)]
+            Grip("close", "REACHING", width=0.0, holds=True, early=True, lead=lead, expected_width=SEEN)]
 
 
 class Take(Task[View]):
     """Take an object of known width, bring it, and release it."""
+
+    lead = 0.0
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -34,8 +36,9 @@ class Take(Task[View]):
         if self.status.state == "BRINGING" and not view.holding:
             self.end("DONE")
         elif self.status.state != "DONE":
-            self.queue += [*([] if view.holding else take()), Move("bring", "BRINGING", goal=THERE, carries=True),
-                         Grip("release", "BRINGING", width=0.08, holds=False, carries=True, early=True)]
+            self.queue += [*([] if view.holding else take(self.lead)),
+                           Move("bring", "BRINGING", goal=THERE, carries=True),
+                           Grip("release", "BRINGING", width=0.08, holds=False, carries=True, early=True)]
 
 
 class Hand(Cell):
@@ -302,6 +305,16 @@ def test_fingers_closed_before_arrival_are_no_failure_and_the_next_close_is_not_
     closing.fingers(SEEN, holding=True)
     assert closing.until_waiting().after, "the release is early again"
     assert closing.status.failures == 0
+
+
+def test_fingers_timed_within_a_motion_are_so_again_after_they_closed_before_arrival(closing: Hand) -> None:
+    closing.arm("aborted", error=m.CLOSED_BEFORE, message="held up")
+    closing.step()
+    closing.fingers(0.0, "aborted", holding=False, outcome="empty")
+    closing.task.lead = 0.4
+    closing.step()
+    closing.fingers(0.08, holding=False)
+    assert closing.until_waiting().lead == 0.4
 
 
 def test_report_from_before_standstill_is_not_a_forgotten_command(waiting: Hand) -> None:
