@@ -259,7 +259,7 @@ async def control(bus: Bus, arms: Sequence[HostedArm], period: float, link: Vacu
 
     def cycle() -> None:
         nonlocal due
-        for arm in arms:
+        for arm in reversed(arms):  # the first one is last: it reports the world, with what all arms hold
             arm.cycle()
         link.update([arm.executor.vacuum for arm in arms if arm.executor.vacuum is not None])
         due = max(due + period, loop.time())  # no burst after an overrun

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from common import messages as m
@@ -9,6 +10,8 @@ from common import topics
 from common.arms import arms_topic
 from common.config import load_cell
 from common.errors import RemoteError
+from common.robot.model import RobotModel
+from common.robot.transforms import invert, pose_to_matrix
 from lab.simulation import Simulation
 
 CELL = str(Path(__file__).parents[1] / "data" / "two_arms.yaml")
@@ -17,14 +20,25 @@ CELL = str(Path(__file__).parents[1] / "data" / "two_arms.yaml")
 @pytest.mark.slow
 def test_both_arms_clear_their_side_of_the_table_into_their_own_box() -> None:
     contained: dict[str, str] = {}
+    cell, moved = load_cell(CELL), {"left": 0.0, "right": 0.0}  # [m] by which an object moved in the hand, at most
 
     async def visit(bus) -> None:
         objects = bus.reader(topics.SCENE_OBJECTS)
+        joints = {arm: bus.reader(arms_topic(topics.JOINT_STATES, arm)) for arm in moved}
+        robots = {arm: RobotModel.load(cell.robots[arm]) for arm in moved}
+        offsets: dict[str, list[np.ndarray]] = {"left": [], "right": []}
         while len(contained) < 2:
             truth = await objects.next()
             contained.update({each.id: each.container for each in truth.objects if each.state == "contained"})
+            for each in truth.objects:
+                arm = "left" if each.id == "ball_1" else "right"
+                if each.state == "held" and abs(joints[arm].latest.header.stamp - truth.header.stamp) < 1e6:
+                    tcp = robots[arm].fk(np.array(joints[arm].latest.position[:7]))
+                    offsets[arm].append((invert(tcp) @ pose_to_matrix(each.pose))[:3, 3])
+        moved.update({arm: float(np.ptp(offsets[arm], axis=0).max()) for arm in moved})
 
-    outcome = Simulation(load_cell(CELL), 1, visit=visit, limit=60.0).run()
+    outcome = Simulation(cell, 1, visit=visit, limit=60.0).run()
+    assert max(moved.values()) < 1e-6, "the ground truth is as old as the joint states of each arm"
     assert (outcome.state, outcome.done, outcome.total) == ("DONE", 2, 2), outcome
     assert contained == {"ball_1": "box_left", "ball_2": "box_right"}
     assert outcome.crashes == [] and outcome.restarts == {}
