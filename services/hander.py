@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from functools import partial
 
 from applications.hand_over.task import Config, Giver, Receiver
@@ -15,6 +16,7 @@ from common.transport.bus import Bus
 
 async def run(bus: Bus, config: Config) -> None:
     """Step the task on every message, and at least 20 times a second."""
+    await asyncio.to_thread(config.require_reachable_meeting)
     other = OtherArm(bus, config.partner, config.arms.robots[config.partner], HANDOVER_STATUS)
     await run_task(bus, config, Giver if config.gives_to else Receiver, HANDOVER_STATUS,
                    partial(HandoverView, other=other.now))

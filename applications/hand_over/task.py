@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from common import messages as m
-from common.tasks.handover import WAITS, Giving, HandoverConfig, HandoverView, Receiving
+from common.errors import ConfigError
+from common.tasks.handover import WAITS, Giving, HandoverConfig, HandoverView, Receiving, backward
 from common.tasks.stages import DwellTimer, View
+from tools.check.arm import Arm
 
 
 class Config(HandoverConfig):
     """Parameters of the task of one arm: of the giver or of the receiver."""
+
+    def require_reachable_meeting(self) -> None:
+        """Check that the arm reaches the meeting place, and where it comes from, with the tool towards the other arm.
+
+        Raises:
+            ConfigError: it does not; names the arm.
+        """
+        arm, ends = Arm(self.robot, self.world), list(self.tools_at_meeting(np.eye(4)))
+        if why := arm.why_not(ends) or arm.why_not([backward(T, self.back_off) for T in ends]):
+            raise ConfigError("meeting", list(self.meeting), f"is out of reach of {self.arms.own} with the tool "
+                              f"towards {self.partner}, or {self.back_off:g} m before it: {why}")
 
 
 class Giver(Giving):

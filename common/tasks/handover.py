@@ -92,6 +92,17 @@ class HandoverConfig(HandlingConfig):
             raise ConfigError("gives_to", self.gives_to, "and takes_from: one of both must name another arm; choices: "
                               + ", ".join(others))
 
+    def tools_at_meeting(self, T_tcp_object: Array) -> Iterator[Array]:
+        """Yield tool poses (4, 4) towards the other arm with the object at the meeting place, turned by quarters."""
+        away = np.subtract(self.arms.robots[self.partner].base_position, self.robot.base_position) * (1, 1, 0)
+        z = away / np.linalg.norm(away)
+        for quarter in range(4):
+            T = np.eye(4)
+            upright = np.column_stack([np.cross((0, 0, 1), z), (0, 0, 1), z])
+            T[:3, :3] = upright @ rpy_to_matrix(0.0, 0.0, quarter * math.pi / 2)
+            T[:3, 3] = self.meeting - T[:3, :3] @ T_tcp_object[:3, 3]
+            yield T
+
 
 class Handover(Handling):
     """What giver and receiver share."""
@@ -115,7 +126,7 @@ class Handover(Handling):
         return [
             *([Grip("open", "HOMING", width=self.gripper.max_width)] if view.gripper.width < self.gripper.max_width - AT
               and not view.holding else []),
-            self._line("withdraw", "HOMING", None, [_backward(tool, self.p.back_off)], partner, held),
+            self._line("withdraw", "HOMING", None, [backward(tool, self.p.back_off)], partner, held),
             self.home(view), AwaitImage()]
 
     def _line(self, name: str, state: str, cycle: Cycle | None, ends: list[Array], partner: Partner,
@@ -150,25 +161,14 @@ class Giving(Handover):
 
     def put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View, width: float | None) -> list[Stage]:
         """Carry the object to the meeting place, the tool towards the other arm."""
-        ends = list(self._offers(pose_to_matrix(held)))
+        ends = list(self.p.tools_at_meeting(pose_to_matrix(held)))
         expected = None if view.holding else held
         return [
-            Move("to the meeting", "PLACING", cycle, goal=_any([_backward(T, self.p.back_off) for T in ends]),
+            Move("to the meeting", "PLACING", cycle, goal=_any([backward(T, self.p.back_off) for T in ends]),
                  carries=True, attach=thing.id, attach_pose=expected),
             Move("offer", "PLACING", cycle, goal=_any(ends), straight=True, carries=True, attach=thing.id,
                  attach_pose=expected, tool_speed=self.p.meeting_speed),
         ]
-
-    def _offers(self, T_tcp_object: Array) -> Iterator[Array]:
-        """Yield tool poses (4, 4) with the object at the meeting place, turned about the tool by quarters."""
-        away = np.subtract(self.p.arms.robots[self.p.partner].base_position, self.p.robot.base_position) * (1, 1, 0)
-        z = away / np.linalg.norm(away)
-        for quarter in range(4):
-            T = np.eye(4)
-            upright = np.column_stack([np.cross((0, 0, 1), z), (0, 0, 1), z])
-            T[:3, :3] = upright @ rpy_to_matrix(0.0, 0.0, quarter * math.pi / 2)
-            T[:3, 3] = self.p.meeting - T[:3, :3] @ T_tcp_object[:3, 3]
-            yield T
 
     def decide(self, view: View) -> None:
         """Offer what is held; open the gripper only when that of the other arm holds the object, too."""
@@ -236,7 +236,7 @@ class Receiving(Handover):
         cycle = Cycle(thing.id)
         self.queue += [
             Grip("open", "GRASPING", cycle, width=self.opening(width)),
-            Move("approach", "GRASPING", cycle, goal=_any([_backward(T, self.p.back_off) for T in ends]),
+            Move("approach", "GRASPING", cycle, goal=_any([backward(T, self.p.back_off) for T in ends]),
                  needs_full_plan=True),
             self._line("reach", "GRASPING", cycle, ends, partner, thing),
             Grip("close", "GRASPING", cycle, width=0.0, holds=True, effort=thing.grip_effort, mass=thing.mass,
@@ -257,7 +257,8 @@ class Receiving(Handover):
         return False
 
 
-def _backward(T_world_tcp: Array, distance: float) -> Array:
+def backward(T_world_tcp: Array, distance: float) -> Array:
+    """Return the tool pose (4, 4) that is farther back along the tool by a distance [m]."""
     back = T_world_tcp.copy()
     back[:3, 3] -= distance * T_world_tcp[:3, 2]
     return back

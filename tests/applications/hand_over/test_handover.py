@@ -13,11 +13,12 @@ from common import topics
 from common.arms import arms_topic
 from common.config import Cell, load_cell, service_config
 from common.robot.model import RobotModel
-from common.tasks.handover import Receiving, _backward
+from common.tasks.handover import Receiving, backward
 from common.tasks.stages import Move
 from common.transport.bus import Bus
 from lab.simulation import Simulation
 from tests.two_arms import judged
+from tools.check.cell import wiring
 
 ARMS = ("left", "right")
 ONE = ('world.objects=[{id: part_1, shape: box, size: [0.05, 0.04, 0.06], x: 0.5, y: 0.35, yaw: 0.3, '
@@ -52,6 +53,21 @@ class Watch:
     async def until(self, arm: str, stage: str) -> None:
         while (await self.status[arm].next()).stage != stage:
             pass
+
+
+@pytest.mark.parametrize(("meeting", "out_of_reach"), [
+    ("[0.5, 0.0, 0.45]", {}), ("[0.5, -0.75, 0.45]", {"left": "it is 1.31 m", "right": "the arm cannot"}),
+    ("[0.5, -0.45, 0.45]", {"left": ""})])
+def test_meeting_place_out_of_reach_is_refused_at_the_start_and_by_check(
+    meeting: str, out_of_reach: dict[str, str]
+) -> None:
+    checked = load_cell("handover", [f"services.hander.meeting={meeting}"])
+    entries = {name: entry for name, entry in checked.services.items() if entry.kind == "hander"}
+    found = [each.what for each in wiring(checked.model_copy(update={"services": entries})) if "meeting" in each.what]
+    assert len(found) == len(out_of_reach)
+    for what, (arm, why) in zip(found, out_of_reach.items(), strict=True):
+        assert what.startswith(f"services.{arm}_hander.meeting: {meeting} is out of reach of {arm} with the tool")
+        assert why in what
 
 
 @pytest.mark.slow
@@ -89,7 +105,7 @@ def short_of_the_object(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
         if name == "reach" and attempts:
             attempts.pop()
             state, cycle, ends, *others = rest
-            rest = (state, cycle, [_backward(end, 0.06) for end in ends], *others)  # type: ignore[attr-defined]
+            rest = (state, cycle, [backward(end, 0.06) for end in ends], *others)  # type: ignore[attr-defined]
         return line(self, name, *rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Receiving, "_line", shorter)
