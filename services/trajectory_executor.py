@@ -210,7 +210,7 @@ async def run(
     robots = hosted_arms(config, bus.service)
     simulated = has_simulated_world(next(iter(robots.values())))
     stops = StopOfAllArms(bus, [name for name in config.arms.robots if name not in robots])
-    arms = [HostedArm(name, bus, config, robot, stops, reports_world=simulated and not at)
+    arms = [HostedArm(name, bus, config, robot, stops, reports_world=simulated and at == len(robots) - 1)
             for at, (name, robot) in enumerate(robots.items())]
     link = VacuumLink(bus, robots.values(), simulated)
     if config.arms.robots and not config.arms.own:  # STOP of the cell, for clients that name no arm
@@ -259,7 +259,7 @@ async def control(bus: Bus, arms: Sequence[HostedArm], period: float, link: Vacu
 
     def cycle() -> None:
         nonlocal due
-        for arm in reversed(arms):  # the first one is last: it reports the world, with what all arms hold
+        for arm in arms:
             arm.cycle()
         link.update([arm.executor.vacuum for arm in arms if arm.executor.vacuum is not None])
         due = max(due + period, loop.time())  # no burst after an overrun

@@ -103,7 +103,7 @@ def create_executors(
             hardware.gripper = hardware.gripper or vacuum
         cell = None if within is None else SimulatedCell(
             within, hardware, model, simulator=config.world.simulator, persisted=persisted[arm], saver=savers[arm],
-            first=first_cell)
+            first=first_cell, reports=arm == [*models][-1])
         first_cell = first_cell or cell
         tool = described_tool(model)
         force = ForceSensing(hardware, model, model.config.tcp_link, model.config.gripper, model.config.wrench,

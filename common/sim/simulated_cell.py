@@ -90,7 +90,7 @@ class SimulatedCell:
     def __init__(
         self, world: SimulatedWorld, hardware: Hardware, kinematics: Kinematics | None, *,
         simulator: str = "kinematic", persisted: SimulationState | None = None, saver: Saver | None = None,
-        first: SimulatedCell | None = None,
+        first: SimulatedCell | None = None, reports: bool = True,
     ) -> None:
         """Surround this hardware.
 
@@ -101,7 +101,8 @@ class SimulatedCell:
             simulator: name of the simulator.
             persisted: the state before a restart, which `restore` applies.
             saver: of the state.
-            first: that of the first arm, if this is a further one in the same world: it reports the objects.
+            first: that of the first arm, if this is a further one in the same world.
+            reports: whether it reports the objects: the last arm does, once all have moved what they hold.
 
         Raises:
             ConfigError: the gripper cannot be blocked by objects.
@@ -118,7 +119,7 @@ class SimulatedCell:
         self._published_version, self._published_at = -1, -math.inf  # cell time [s]
         self._saved: tuple[object, ...] = ()
         self._saved_objects: tuple[int, dict[str, ObjectSnapshot]] | None = None  # with the version of the world
-        self._first = first
+        self._first, self._reports = first, reports
         self._suspended = False
         self.defers_steps = False
         self.deferred: Callable[[], None] | None = None
@@ -172,7 +173,7 @@ class SimulatedCell:
 
     def updates(self, header: Header) -> tuple[list[SceneUpdate], WorldObjects | None]:
         """Return the events since the last call, and all objects if it is time to publish a change."""
-        if self.suspended or self._first is not None:
+        if self.suspended or not self._reports:
             return [], None
         events = [update.model_copy(update={"header": header}) for update in self._world.take_events()]
         now = header.stamp * 1e-9
@@ -198,7 +199,7 @@ class SimulatedCell:
 
     def conveyors(self, header: Header, stopped: int) -> ConveyorState | None:
         """Return the state of all belts if it is to be published; `stopped` is the time of a STOP, or 0 [ns]."""
-        if self.suspended or self._first is not None:
+        if self.suspended or not self._reports:
             return None
         self._belts.apply_stop(stopped)
         return self._belts.changed(header)
