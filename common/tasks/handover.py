@@ -207,10 +207,15 @@ class Receiving(Handover):
         if view.holding and view.gripper.outcome not in MISSES and (partner is None or self.meets(view)):
             if not self.ends_with(partner, view, "; the object is still in the gripper"):
                 self.status.message = f"{WAITS} {self.p.partner} has withdrawn"
-        elif not view.holding and partner is not None and self._offered(partner) and not self.meets(view):
+        elif not view.holding and partner is not None and self._offered(partner) and not self.meets(view) and (
+                self._has_looked(view)):
             self._take_offered(partner)
         else:
             super().decide(view)
+
+    def _has_looked(self, view: View) -> bool:
+        """Return whether an image shows all that it has put down: its destination would be occupied otherwise."""
+        return self._began is not None and view.settled_stamp > max(self.images_after, self._began)
 
     def _offered(self, partner: Partner) -> bool:
         return partner.has and partner.rests and partner.holds is not None and (
