@@ -17,6 +17,7 @@ from mcap.reader import make_reader
 
 from cli.main import app
 from common import topics
+from common.application import message_class
 from common.client.json_codec import message_from_json
 from common.config import load_cell
 from common.messages.schema import EXAMPLES
@@ -62,6 +63,15 @@ def payloads(tmp_path_factory: pytest.TempPathFactory) -> Payloads:
 def error_of(schema: Any, payload: bytes) -> str:
     error = next(Validator(schema).iter_errors(msgpack.unpackb(payload)), None)
     return "" if error is None else f"{error.json_path}: {error.message[:200]}"
+
+
+def test_field_that_messages_leave_out_has_its_default_in_the_schema(schemas: dict[str, Any]) -> None:
+    omitting = [found for name in schemas if (found := message_class(name)) is not None and found.omitted_defaults]
+    assert len(omitting) > 5
+    for model in omitting:
+        schema = schemas[model.__name__]
+        assert not {*model.omitted_defaults} & {*schema.get("required", [])}, model
+        assert all("default" in schema["properties"][name] for name in model.omitted_defaults), model
 
 
 def test_every_recorded_payload_holds_its_schema(schemas: dict[str, Any], payloads: Payloads) -> None:
