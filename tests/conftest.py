@@ -5,8 +5,12 @@ import tempfile
 from itertools import count
 from pathlib import Path
 
-import pytest
-from hypothesis import settings
+from common.process.environment import set_startup_variables
+
+set_startup_variables()  # before numpy is imported, as in every process of a cell
+
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
 
 # A background job of a script ignores SIGINT, and so would all processes that the tests start.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:

@@ -136,28 +136,26 @@ def pixel_spans(pixels: Array, width: int, height: int, reach: float) -> tuple[I
 
     With `reach` 0: pixels whose centers are inside; with 0.5: a superset of the pixels that it touches.
     """
-    low, high = pixels[..., 1].min(axis=1), pixels[..., 1].max(axis=1)
+    left, low = np.moveaxis(pixels.min(axis=1), -1, 0)
+    right, high = np.moveaxis(pixels.max(axis=1), -1, 0)
     first = np.maximum(np.ceil(low - reach - SLACK), 0).astype(np.int64)
     last = np.minimum(np.floor(high + reach + SLACK), height - 1).astype(np.int64)
-    seen = (last >= first) & (pixels[..., 0].max(axis=1) > -1) & (pixels[..., 0].min(axis=1) < width)
+    inward = _inward(pixels)
+    seen = (last >= first) & (right > -1) & (left < width) & np.isfinite(inward[:, 0, 0])
     which = np.flatnonzero(seen)
     triangle, step = _ramps(which, (last - first + 1)[which])
     row = first[triangle] + step
-    left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
-    bottom, top = row - reach - SLACK, row + reach + SLACK
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        p, q = pixels[triangle, a], pixels[triangle, b]
-        rise = q[:, 1] - p[:, 1]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            s, t = (bottom - p[:, 1]) / rise, (top - p[:, 1]) / rise
-        level = np.abs(rise) < 1e-12
-        s, t = np.where(level, 0.0, np.clip(s, 0, 1)), np.where(level, 1.0, np.clip(t, 0, 1))
-        meets = (np.minimum(p[:, 1], q[:, 1]) <= top) & (np.maximum(p[:, 1], q[:, 1]) >= bottom)
-        for along in (s, t):
-            x = p[:, 0] + along * (q[:, 0] - p[:, 0])
-            left, right = np.where(meets, np.minimum(left, x), left), np.where(meets, np.maximum(right, x), right)
-    start = np.maximum(np.ceil(np.clip(left - reach, -1, width) - SLACK), 0).astype(np.int64)
-    end = np.minimum(np.floor(np.clip(right + reach, -1, width) + SLACK), width - 1).astype(np.int64)
+    # A side meets a row at x - lean (row - y), and in the rows' band up to lean (reach + SLACK) aside.
+    across, along = inward[..., 0].T, inward[..., 1].T
+    lean = np.divide(along, across, out=np.zeros_like(across), where=across != 0)
+    aside = np.abs(lean) * (reach + SLACK)
+    start, end = left[triangle], right[triangle]
+    for k in range(3):
+        x = pixels[triangle, k, 0] - lean[k, triangle] * (row - pixels[triangle, k, 1])
+        start = np.maximum(start, np.where(across[k] > 0, -aside[k], -np.inf)[triangle] + x)
+        end = np.minimum(end, np.where(across[k] < 0, aside[k], np.inf)[triangle] + x)
+    start = np.maximum(np.ceil(np.clip(start - reach, -1, width) - SLACK), 0).astype(np.int64)
+    end = np.minimum(np.floor(np.clip(end + reach, -1, width) + SLACK), width - 1).astype(np.int64)
     full = end >= start
     return triangle[full], row[full], start[full], end[full]
 
@@ -202,12 +200,15 @@ def _cast_centers(pixels: Array, plane: Array, camera: Pinhole, depth: Depth) ->
     winner = np.full(best.shape, -1, np.int64)
     for batch in _batches(pixels, camera.width, camera.height):
         triangle, row, start, end = pixel_spans(pixels[batch], camera.width, camera.height, 0.0)
-        span, step = _ramps(np.arange(len(triangle)), end - start + 1)
-        of, column = triangle[span] + batch.start, start[span] + step
-        near = plane[of, 0] * column + plane[of, 1] * row[span] + plane[of, 2]
-        flat = row[span] * camera.width + column
-        inside = near > best[flat]
-        of, near, flat = of[inside], near[inside], flat[inside]
+        triangle += batch.start
+        count = end - start + 1
+        column, step = _ramps(start, count)
+        column += step
+        flat = np.repeat(row * camera.width, count) + column
+        a, b, c = plane[triangle].T
+        near = np.repeat(a, count) * column + np.repeat(b * row + c, count)
+        nearer = near > best[flat]
+        of, near, flat = np.repeat(triangle, count)[nearer], near[nearer], flat[nearer]
         np.maximum.at(best, flat, near)
         won = near == best[flat]
         winner[flat[won][::-1]] = of[won][::-1]  # at equal depth the first mesh wins
@@ -225,37 +226,46 @@ def _antialias(pixels: Array, plane: Array, colors: Pixels, meshes: Ints, colour
     if not len(flat_edges):
         return
     height, width = meshes.shape
-    place = np.full(height * width, -1, np.int64)
-    place[flat_edges] = np.arange(len(flat_edges))
-    some_edge = np.cumsum(np.pad(edge, ((0, 0), (1, 0))), axis=1)
+    before = np.concatenate([[0], np.cumsum(edge)])  # number of edge pixels before each pixel, row by row
     offsets = _spread(SAMPLES)
     with np.errstate(divide="ignore"):
-        best = np.repeat((1.0 / behind.depth.ravel()[flat_edges].astype(np.float64))[:, None], SAMPLES, axis=1)
+        least = 1.0 / behind.depth.ravel()[flat_edges].astype(np.float64)  # of 1/depth in all of an edge pixel
+    best = np.repeat(least[:, None], SAMPLES, axis=1)
     mixed = np.repeat(behind.colour.reshape(-1, 3)[flat_edges][:, None], SAMPLES, axis=1)
+    inward = _inward(pixels)
+    reach, tilt = np.abs(inward).sum(axis=2) / 2, np.abs(plane[:, :2]).sum(axis=1) / 2  # from the center to a corner
     for batch in _batches(pixels, width, height):
         triangle, row, start, end = pixel_spans(pixels[batch], width, height, 0.5)
-        near_edge = some_edge[row, end + 1] > some_edge[row, start]
-        triangle, row, start, end = triangle[near_edge] + batch.start, row[near_edge], start[near_edge], end[near_edge]
-        span, step = _ramps(np.arange(len(triangle)), end - start + 1)
-        of, u, v = triangle[span], start[span] + step, row[span]
-        at = place[v * width + u]
-        at_edge = at >= 0
-        of, u, v, at = of[at_edge], u[at_edge], v[at_edge], at[at_edge]
-        a, b, c = (pixels[of, k] - np.stack([u, v], axis=1) for k in range(3))
-        turn = np.sign(_cross(b - a, c - a))
+        first, last = before[row * width + start], before[row * width + end + 1]
+        of, step = _ramps(triangle + batch.start, last - first)
+        at = np.repeat(first, last - first) + step
+        v, u = np.divmod(flat_edges[at], width)
+        # Of each side, and 1/depth: at the center of the pixel. A product is negative outside of the side.
+        side = (inward[of] * (np.stack([u, v], axis=1)[:, None] - pixels[of])).sum(axis=2)
+        near = plane[of, 0] * u + plane[of, 1] * v + plane[of, 2]
+        covered = (side >= reach[of] - SLACK).all(axis=1)
+        np.maximum.at(least, at[covered], (near - tilt[of])[covered])
+        kept = (side >= -reach[of] - SLACK).all(axis=1) & (near + tilt[of] >= least[at])
+        of, at, side, near = of[kept], at[kept], side[kept], near[kept]
         inside = np.ones((len(of), SAMPLES), bool)
-        for p, q in ((a, b), (b, c), (c, a)):
-            side = (q - p)[:, None]
-            inside &= turn[:, None] * _cross(side, offsets[None] - p[:, None]) >= -SLACK
-        hit, sample = np.nonzero(inside & (turn != 0)[:, None])
-        x, y = u[hit] + offsets[sample, 0], v[hit] + offsets[sample, 1]
-        near = plane[of[hit], 0] * x + plane[of[hit], 1] * y + plane[of[hit], 2]
-        nearer = near > best[at[hit], sample]
-        hit, sample, near = hit[nearer], sample[nearer], near[nearer]
-        np.maximum.at(best, (at[hit], sample), near)
-        won = near == best[at[hit], sample]
-        mixed[at[hit][won][::-1], sample[won][::-1]] = colors[of[hit][won][::-1]]
+        for k in range(3):
+            inside &= side[:, k, None] + inward[of, k] @ offsets.T >= -SLACK
+        hit, sample = np.nonzero(inside)
+        of, at, near = of[hit], at[hit], (near[:, None] + plane[of, :2] @ offsets.T)[inside]
+        nearer = near > best[at, sample]
+        of, at, sample, near = of[nearer], at[nearer], sample[nearer], near[nearer]
+        np.maximum.at(best, (at, sample), near)
+        won = near == best[at, sample]
+        mixed[at[won][::-1], sample[won][::-1]] = colors[of[won][::-1]]
     colour.reshape(-1, 3)[flat_edges] = np.rint(mixed.mean(axis=1)).astype(np.uint8)
+
+
+def _inward(pixels: Array) -> Array:
+    """Normals (n, 3, 2) of the sides of triangles, towards the inside and as long as the side; NaN of flat ones."""
+    sides = np.roll(pixels, -1, axis=1) - pixels
+    turn = np.sign(_cross(sides[:, 0], sides[:, 1]))
+    turn[turn == 0] = np.nan
+    return turn[:, None, None] * np.stack([-sides[..., 1], sides[..., 0]], axis=-1)
 
 
 def _cross(a: Array, b: Array) -> Array:
