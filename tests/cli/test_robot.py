@@ -336,7 +336,7 @@ def test_table_container_and_camera_suit_the_size_of_the_arm(size, below, camera
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, pytest.param(7, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize("arm", [
-    scara, lambda: six(0.08), lambda: six(1.0), pytest.param(nodding, marks=pytest.mark.campaign),
+    scara, lambda: six(0.08), *(pytest.param(each, marks=pytest.mark.campaign) for each in (lambda: six(1.0), nodding)),
     "package://example-robot-data/robots/z1_description/urdf/z1.urdf"])
 def test_arm_of_any_size_of_four_joints_or_with_one_jaw_clears_its_table(arm, count, tmp_path):
     if not isinstance(arm, str):

@@ -24,7 +24,7 @@ def test_task_with_a_covered_camera_never_ends_done() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", [[], SIDE], ids=["above", "side"])
+@pytest.mark.parametrize("place", [[], pytest.param(SIDE, marks=pytest.mark.campaign)], ids=["above", "side"])
 @pytest.mark.parametrize(("count", "seed"), [
     (2, 1), *(pytest.param(7, seed, marks=pytest.mark.campaign) for seed in (1, 2))])
 def test_table_is_cleared_with_the_arm_in_the_image(place: list[str], count: int, seed: int) -> None:

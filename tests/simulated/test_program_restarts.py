@@ -30,7 +30,7 @@ def in_boxes(folder: Path, text: str = MOVE_BOX) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("stage", [
-    "lift", "leave", pytest.param("descend", marks=pytest.mark.slow), pytest.param("lower", marks=pytest.mark.slow)])
+    "lift", "leave", *(pytest.param(stage, marks=pytest.mark.campaign) for stage in ("descend", "lower"))])
 def test_runner_killed_while_it_handles_an_object_continues_with_it_on_request(tmp_path: Path, stage: str) -> None:
     made: list[Simulation] = []
     truth: list[m.WorldObjects] = []

@@ -109,7 +109,7 @@ def test_motions_that_are_not_proved_against_the_other_arm_are_refused() -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pressed", ["left", "right"])
+@pytest.mark.parametrize("pressed", [pytest.param("left", marks=pytest.mark.campaign), "right"])
 def test_stop_of_an_operator_on_one_arm_stops_both_and_a_task_stops_only_its_own(pressed: str) -> None:
     seen: dict[str, m.MotionStatus] = {}
 
