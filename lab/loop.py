@@ -33,6 +33,7 @@ class Incarnation:
     def __init__(self, name: str) -> None:
         self.name = name
         self.over = False
+        self.paused_until = 0.0  # nothing of it runs before this time of the loop [s]
         self.turns = 0  # callbacks run so far
         self.at_turn: tuple[int, Callable[[], None]] | None = None  # called instead of that callback
         self.skipped: list[tuple[Callable[..., object], tuple[object, ...], Context]] = []  # callbacks never run
@@ -143,6 +144,10 @@ class VirtualTimeLoop(base_events.BaseEventLoop):
             self._now = max(self._now, scheduled[0][0])
         while scheduled and scheduled[0][0] <= self._now:
             _, timer = heapq.heappop(scheduled)
+            incarnation = timer._context.get(_current)
+            if incarnation is not None and incarnation.paused_until > self._now:
+                heapq.heappush(scheduled, (incarnation.paused_until, timer))
+                continue
             timer._scheduled = False
             if not timer._cancelled:
                 ready.append(timer)

@@ -152,6 +152,10 @@ class Simulation:
         """Kill a process of the cell, as SIGKILL does."""
         self._host.processes[name].kill()
 
+    def pause(self, name: str, seconds: float) -> None:
+        """Give a process no processor for a time [s]: it runs no timers and receives no messages until then."""
+        self._host.processes[name].incarnation.paused_until = self._loop.time() + seconds
+
     def lose_router(self, seconds: float) -> None:
         """Cut all links for a time [s], as while the router restarts."""
         self._network.lose_router()

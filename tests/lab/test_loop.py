@@ -110,6 +110,20 @@ def test_incarnation_is_killed_at_a_given_turn():
     run(main)
 
 
+def test_paused_incarnation_runs_its_timers_in_order_after_the_pause():
+    async def main(loop):
+        incarnation, ran = Incarnation("paused"), []
+        incarnation.paused_until = 1.0
+        for delay in (0.2, 0.1, 1.5):
+            loop.call_later(delay, lambda own=delay: ran.append((own, loop.time())), context=context_of(incarnation))
+        await asyncio.sleep(0.5)
+        assert ran == []
+        await asyncio.sleep(2.0)
+        assert ran == [(0.1, 1.0), (0.2, 1.0), (1.5, 1.5)]
+
+    run(main)
+
+
 def order_of_turns(seed, *, shuffled=True):
     async def main(loop):
         order, contexts = [], {name: context_of(Incarnation(name)) for name in "abc"}
