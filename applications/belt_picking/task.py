@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from statistics import median_low
+from typing import Literal
 
 from pydantic import Field
 
@@ -11,12 +14,14 @@ from common import messages as m
 from common.config import Tunable
 from common.errors import ConfigError
 from common.robot.transforms import tool_down
-from common.tasks.handling import Handling, HandlingConfig, grasp_directions
-from common.tasks.stages import Cycle, Grip, Move, Stage, View, place_of
+from common.tasks.handling import Handling, HandlingConfig, grasp_directions, top_of
+from common.tasks.stages import AwaitImage, Command, Cycle, Grip, Move, Report, Stage, View, place_of
 from common.tasks.tracking import Expected, pick_stages, time_grip
 
 SKIPPED_FOR = 0.4  # [s] after a failed plan: the object is elsewhere then
-LONGEST_LEAD = 4.0  # [s] on a host that plans slowly
+LEAST_LEAD, LONGEST_LEAD = 0.3, 4.0  # [s] on a host that plans quickly or slowly
+LATENCIES, RESERVE = 5, 1.5  # the median of so many newest latencies counts; lead for it
+CLEAR = 0.03  # [m] between the tool and the objects below it, from which it may move to one of them
 SAME_SPEED = 0.012  # [m/s] between belt and object: it moves with the belt
 STEADY = 0.002  # [m/s] of the belt to its set speed: it neither starts nor brakes
 
@@ -28,7 +33,8 @@ class Config(HandlingConfig):
     window: tuple[float, float] = Field(
         (0.3, 0.9), description="objects are met and lifted between these distances from the start of the belt [m]")
     lead_time: Tunable[float] = Field(
-        0.5, ge=0.1, le=5, description="from the decision to the start of the arm, in which it is planned [s]")
+        0.5, ge=0.1, le=5, description="from the decision to the start of the arm, in which it is planned, until the "
+                                       "time that this needs was measured [s]")
     deviation: Tunable[float] = Field(
         0.006, gt=0, le=0.05, description="the motion ends before the fingers close if the belt puts the object so far "
                                           "from where it was expected [m]")
@@ -72,9 +78,27 @@ class BeltPicking(Handling):
         self._expected: Expected | None = None
         self._skipped: dict[str, float] = {}  # until when, by object [s]
         self._attempts = 0
-        self._lead = config.lead_time  # [s] more while plans come too late
+        self._latencies: deque[float] = deque(maxlen=LATENCIES)  # from a decision to the accepted motion [s]
+        self._decided = 0.0  # cell time of the last decision [s]
+        self._took = 0.0  # planned duration of the last motion with an object [s]
 
     # --- decisions -----------------------------------------------------------------------------------------------
+
+    @property
+    def _lead(self) -> float:
+        """Time from a decision to the start of the arm, by what the last ones needed [s]."""
+        if not self._latencies:
+            return self.p.lead_time
+        return min(max(RESERVE * median_low(self._latencies), LEAST_LEAD), LONGEST_LEAD)
+
+    def decide(self, view: View) -> None:
+        """Pick the next object from where the arm is, if one is in reach: it may leave before the arm is at home."""
+        if view.holding or self.status.state == "DONE" or not self._in_reach(view):
+            super().decide(view)
+        elif self._is_low(view):
+            self.queue += [self.retreat(view), AwaitImage()]
+        elif self.has_fresh_image(view):
+            self.choose(view)
 
     def choose(self, view: View) -> None:
         """Wait for an object in reach that moves evenly, and pick it."""
@@ -91,11 +115,15 @@ class BeltPicking(Handling):
         self.status.message = self._problem_of(view)
         if self.status.message:
             return
-        for way, thing in coming:
-            waits = self._skipped.get(thing.id, 0.0) > view.now
-            if not waits and self._is_near(way, thing) and self._moves_along(thing, view):
-                self._pick(way, thing, view)
-                return
+        for way, thing in self._in_reach(view)[:1]:
+            self._pick(way, thing, view)
+
+    def _in_reach(self, view: View) -> list[tuple[float, m.CollisionObject]]:
+        """Return the objects that can be met now, farthest first, with their distance from the start [m]."""
+        assert isinstance(view, BeltView)
+        return [] if self._problem_of(view) else [
+            (way, thing) for way, thing in self._coming(view) if self._is_near(way, thing)
+            and self._skipped.get(thing.id, 0.0) <= view.now and self._moves_along(thing, view)]
 
     def _coming(self, view: View) -> Iterator[tuple[float, m.CollisionObject]]:
         """Yield the objects before the end of the window, farthest first, with their distance from the start [m]."""
@@ -122,6 +150,17 @@ class BeltPicking(Handling):
         """Return whether an object will be in the window when the arm can be there; it is not met long before."""
         return way + self._speed_of(thing) * 2 * self._lead >= self.p.window[0]
 
+    def _would_miss(self, view: View) -> bool:
+        """Return whether the next object is in reach now, but not after the queued motion home and an image there."""
+        home = next((stage.seconds for stage in self.queue if isinstance(stage, Move)), 0.0)
+        needed = home + view.now - view.scene_stamp + self._lead + self._took
+        return any(way + self._speed_of(thing) * needed > self.p.window[1] for way, thing in self._in_reach(view)[:1])
+
+    def _is_low(self, view: View) -> bool:
+        """Return whether the tool may be between objects on the belt."""
+        assert isinstance(view, BeltView)
+        return view.tool[2] < max((top_of(thing) for _, thing in self._coming(view)), default=self._belt.top) + CLEAR
+
     def _speed_of(self, thing: m.CollisionObject) -> float:
         (c, s), v = self._belt.direction, thing.velocity
         return c * v.x + s * v.y
@@ -137,6 +176,7 @@ class BeltPicking(Handling):
         x, y, z = place_of(thing.pose)
         ways = grasp_directions(thing, self.gripper.closing_axis, self.gripper.max_width)
         yaw, width = min(ways, key=self._sideways)
+        self._decided = view.now
         stamp, begin = view.scene.header.stamp, round((view.now + self._lead) * 1e9)
         self._expected = Expected(self._name, view.belts.header.stamp * 1e-9, belt.position, belt.speed,
                                   begin * 1e-9)
@@ -163,6 +203,8 @@ class BeltPicking(Handling):
         grip = next((stage for stage in self.queue if isinstance(stage, Grip)), None)
         if move.name == "track" and response.ok and grip is not None and self._expected is not None:
             self._expected.closes = time_grip(grip, move, response)
+            assert response.trajectory is not None
+            self._took = response.trajectory.points[-1].time_from_start
 
     def plan_failed(self, move: Move, response: m.PlanResponse, view: View) -> None:
         """Leave an object that cannot be met for a moment: another one may be."""
@@ -179,11 +221,26 @@ class BeltPicking(Handling):
         if stage.name == "track" and isinstance(stage, Move):
             late = view.now - stage.start_at * 1e-9
             if late > 0.0:
-                self._lead = min(self._lead + late + self.p.lead_time, LONGEST_LEAD)
+                self._latencies.append(view.now - self._decided)
             if late > 0.0 or self._deviates(view):
                 self.clear()
                 return False
         return super().may_start(stage, view)
+
+    def on_goal(self, answer: Report, view: View) -> None:
+        """Measure how long it took from the decision until the motion was accepted, or came too late."""
+        one = self.running
+        if one is not None and one.stage.name == "track" and one.command.id == answer.id:
+            self._latencies.append(view.now - self._decided)
+        super().on_goal(answer, view)
+
+    def stop(self, view: View, reason: str, by: Literal["operator", "requester"] = "requester") -> list[Command]:
+        """Stop the arm; an object that it has not been near is still where the last image showed it."""
+        seen, running = self.images_after, self.running
+        commands = super().stop(view, reason, by)
+        if by == "requester" and running is not None and running.stage.name == "track" and not self._is_low(view):
+            self.images_after = seen
+        return commands
 
     def outdated(self, stage: Stage, view: View) -> str:
         """Return why the object is not where the motion leads, until the fingers begin to close."""
@@ -217,6 +274,8 @@ class BeltPicking(Handling):
         """Count attempts, and objects that were put down."""
         super().succeeded(stage, view)
         self._attempts += stage.name == "track"
+        if stage.name == "up" and self._would_miss(view):
+            self.clear()
         if stage.name == "release":
             self.status.done += 1
             self.status.total = self.status.done

@@ -61,3 +61,22 @@ def test_belt_that_stops_before_the_grasp_ends_the_motion_with_open_fingers_and_
     assert seen["state"] == "cancelled"
     assert seen["progress"] < 0.7
     assert seen["width"] > 0.06
+
+
+def test_late_arm_meets_the_cube_again_from_where_it_is_and_leaves_the_planner_the_time_it_needed() -> None:
+    states: list[str] = []
+    waits: list[float] = []  # for the start, after the motion was accepted [s]
+
+    async def visit(bus: Bus) -> None:
+        motion = bus.reader(topics.MOTION_STATUS)
+        for _ in range(2):
+            waits.append(-(await until(motion, lambda one: one.state == "active")).path_time)
+            await until(motion, lambda one: one.progress > 0.3)
+            simulation.pause("trajectory_executor", 0.3)
+            states.append((await until(motion, lambda one: one.state != "active")).state)
+
+    simulation = Simulation(cell(-0.45, 0.12), 1, limit=60.0, visit=visit)
+    outcome = simulation.run()
+    assert (outcome.state, outcome.done, outcome.crashes, outcome.broken) == ("DONE", 1, [], []), outcome
+    assert states == ["cancelled"] * 2
+    assert waits[0] > 0.4 and waits[1] < 0.3
