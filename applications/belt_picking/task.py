@@ -20,7 +20,8 @@ from common.tasks.tracking import Expected, pick_stages, time_grip
 
 SKIPPED_FOR = 0.4  # [s] after a failed plan: the object is elsewhere then
 LEAST_LEAD, LONGEST_LEAD = 0.3, 4.0  # [s] on a host that plans quickly or slowly
-LATENCIES, RESERVE = 5, 1.5  # the median of so many newest latencies counts; lead for it
+LATENCIES = 5  # the median of so many newest latencies counts
+RESERVE = 1.5  # factor on times that were planned or measured
 CLEAR = 0.03  # [m] between the tool and the objects below it, from which it may move to one of them
 SAME_SPEED = 0.012  # [m/s] between belt and object: it moves with the belt
 STEADY = 0.002  # [m/s] of the belt to its set speed: it neither starts nor brakes
@@ -153,7 +154,7 @@ class BeltPicking(Handling):
     def _would_miss(self, view: View) -> bool:
         """Return whether the next object is in reach now, but not after the queued motion home and an image there."""
         home = next((stage.seconds for stage in self.queue if isinstance(stage, Move)), 0.0)
-        needed = home + view.now - view.scene_stamp + self._lead + self._took
+        needed = RESERVE * (home + view.now - view.scene_stamp + self._lead + self._took)
         return any(way + self._speed_of(thing) * needed > self.p.window[1] for way, thing in self._in_reach(view)[:1])
 
     def _is_low(self, view: View) -> bool:
