@@ -70,6 +70,7 @@ class BeltPicking(Handling):
     """Picks in motion."""
 
     p: Config
+    ONE_DESTINATION = True
 
     def __init__(self, config: Config, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
         """Start without an object; the arguments are those of `Task`."""

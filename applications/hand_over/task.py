@@ -18,8 +18,9 @@ class Config(HandoverConfig):
         """Check that the arm reaches the meeting place, and where it comes from, with the tool towards the other arm.
 
         Raises:
-            ConfigError: it does not; names the arm.
+            ConfigError: it does not, or there is no other arm; names the field.
         """
+        self.require_usable()
         arm, ends = Arm(self.robot, self.world), list(self.tools_at_meeting(np.eye(4)))
         if why := arm.why_not(ends) or arm.why_not([backward(T, self.back_off) for T in ends]):
             raise ConfigError("meeting", list(self.meeting), f"is out of reach of {self.arms.own} with the tool "

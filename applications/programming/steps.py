@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, JsonValue
+from pydantic import AfterValidator, Field, JsonValue
 from pydantic import model_validator as after
 
 from applications.programming.building import RUNNING, Builder, Built
@@ -246,13 +246,19 @@ class Call(BaseStep):
         return f"call {self.program}"
 
 
+def _require_length(direction: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(direction):
+        raise ValueError("must not be 0 along all axes")
+    return direction
+
+
 class Force(BaseStep):
     """What steps have whose end the force at the tool decides."""
 
     UNKNOWN = "the force decides where it ends"
     ENDS_ANYWHERE = True
 
-    direction: Metres3 = (0.0, 0.0, -1.0)
+    direction: Annotated[Metres3, AfterValidator(_require_length)] = (0.0, 0.0, -1.0)
     frame: Literal["base", "tool", "world"] = Field("world", description="whose axes the direction follows")
     touch: list[Word] = Field([], max_length=50, description="ids or classes of objects that may be touched, also by "
                                                              "what is held")

@@ -11,7 +11,7 @@ import math
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -62,6 +62,7 @@ class Handling(Task[View]):
     """Moves objects one after the other and looks from home in between."""
 
     p: HandlingConfig
+    ONE_DESTINATION: ClassVar = False  # for all objects, also for those whose kind a restarted planning scene lost
 
     def __init__(self, config: HandlingConfig, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
         """Start without an object; the arguments are those of `Task`."""
@@ -218,7 +219,7 @@ class Handling(Task[View]):
     def put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View,
             width: float | None) -> list[Stage]:
         """Move above the destination, lower, release, move up, go home and look."""
-        goal = self.destination(thing, view) if thing.kind else None
+        goal = self.destination(thing, view) if thing.kind or self.ONE_DESTINATION else None
         goal = goal or self._aside(thing, view)
         tools = sorted(self._tools(thing, held, goal), key=lambda tool: abs(_yaw(tool)))
         tool = tools[self._tries[cycle.subject] % len(tools)]

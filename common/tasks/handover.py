@@ -194,10 +194,7 @@ class Giving(Handover):
 class Receiving(Handover):
     """Takes what the other arm offers, and puts it down where `destination` says."""
 
-    def put(self, thing: m.CollisionObject, held: m.Pose, cycle: Cycle, view: View, width: float | None) -> list[Stage]:
-        """Put it there also if a restart of the planning scene has lost what it is."""
-        known = thing if thing.kind else thing.model_copy(update={"kind": thing.id})
-        return super().put(known, held, cycle, view, width)
+    ONE_DESTINATION = True
 
     def decide(self, view: View) -> None:
         """Take what is offered; carry it away once the other arm has withdrawn."""

@@ -102,7 +102,7 @@ def build_report(recording: Recording, cell: str | None = None) -> str:
     if left := aggregator.summary.unexplained:
         places = ", ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in left)
         ended = history.tasks[-1].since
-        history.losses.append(Event(ended, "DONE", f"but left at {places}: not rejected by the task"))
+        history.losses.append(Event(ended, "DONE", f"but left at {places}: not reported by the task"))
     if not recording.finished:
         notes.append(truncated_note(recording))
     if skipped:

@@ -247,7 +247,7 @@ def describe(summary: dict[str, Any], application: Figures) -> list[str]:
     if summary.get("overlooked"):
         lines.append(f"  {summary['overlooked']}")
     for x, y, z in summary.get("unexplained", ()):
-        lines.append(f"  left at ({x:.3f}, {y:.3f}, {z:.3f}): not rejected by the task")
+        lines.append(f"  left at ({x:.3f}, {y:.3f}, {z:.3f}): not reported by the task")
     if summary.get("continued") and summary["state"] == "DONE" and seconds["first_motion"] is None:
         lines.append(f"  nothing was left to do in the simulated world of an earlier run, {summary['continued']}: "
                      "`zencell world reset` in `zencell up`, or a run without ZENCELL_STATE, has the first layout")

@@ -78,6 +78,19 @@ def test_unreachable_place_or_pose_is_found(name, overrides, severity, what):
     assert found == [("error", severity == "rejected")], findings
 
 
+@pytest.mark.parametrize(("name", "override", "what"), [
+    ("conveyor", "services.belt_picker.window=[1.4,0.5]",
+     "services.belt_picker.window: [1.4, 0.5] must increase within the belt, 0 to 1.6"),
+    ("handover", "services.hander.left.gives_to=rigt",
+     "services.left_hander.gives_to: 'rigt' and takes_from: one of both must name another arm; choices: right"),
+    ("handover", "services.hander.left.gives_to=left",
+     "services.left_hander.gives_to: 'left' and takes_from: one of both must name another arm; choices: right"),
+])
+def test_values_that_do_not_fit_each_other_are_refused_as_at_the_start(name, override, what):
+    (found,) = wiring(load_cell(name, [override]))
+    assert (found.severity, found.refused, found.what) == ("error", True, what)
+
+
 def test_unknown_link_of_a_camera_is_rejected_with_the_choices():
     found = check_files(load_cell(HAND, ["world.camera.mount=hand"]))
     assert [(each.severity, each.refused) for each in found] == [("error", True)]
@@ -90,7 +103,8 @@ def test_unknown_link_of_a_camera_is_rejected_with_the_choices():
 
 
 @pytest.mark.parametrize(("name", "options"), [
-    (HAND, {}), ("panda", {"seed": 1}), ("panda", {"overrides": ["world.layout=random", "world.count=8"], "seed": 7}),
+    (HAND, {}), ("conveyor", {}), ("panda", {"seed": 1}),
+    ("panda", {"overrides": ["world.layout=random", "world.count=8"], "seed": 7}),
     *(pytest.param("ur5", {"world": world}, marks=[pytest.mark.slow] if world > "w2" else [])
       for world in names_of("worlds") if world != "balls")])
 def test_cells_of_the_project_have_no_findings(name, options):

@@ -103,7 +103,7 @@ def test_finished_run_with_an_unexplained_object_has_a_film_of_its_end(tape):
     tape.images(10, 1)
     page = tape.report()
     assert len(films_of(page)) == 1
-    assert "8.00 s: DONE but left at (0.500, 0.200, 0.030): not rejected by the task" in page.text
+    assert "8.00 s: DONE but left at (0.500, 0.200, 0.030): not reported by the task" in page.text
 
 
 @pytest.mark.parametrize("state", ["PLACING", "IDLE"])

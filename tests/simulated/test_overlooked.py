@@ -22,4 +22,4 @@ async def test_run_with_unexplained_objects_warns_and_exits_3(tmp_path) -> None:
     with RunningCell(tmp_path, "run", "panda", "--set", "world.count=1", "--set", f"{LEAST}=3000") as cell:
         assert await cell.ended(120.0) == 3
     assert "error: world.objects: ball_1 appears on" in cell.text
-    assert "left at (0.400, -0.300, 0.030): not rejected by the task" in cell.text
+    assert "left at (0.400, -0.300, 0.030): not reported by the task" in cell.text

@@ -17,7 +17,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 from common.application import find_application
-from common.config import Cell, GripperConfig, RobotConfig, Surroundings, located
+from common.config import Cell, GripperConfig, RobotConfig, ServiceEntry, Surroundings, located
 from common.errors import ConfigError, ZencellError
 from common.hardware.backends import has_simulated_world, real_arm
 from common.messages import TaskStatus
@@ -85,13 +85,17 @@ def require_valid_services(cell: Cell) -> None:
         return
     for entry in given:
         with contextlib.suppress(WiringFailed):  # its process reports the error
-            _, config = load_service(cell, entry)
-            try:
-                config.require_usable()
-            except ConfigError as problem:
-                raise located(problem, config, entry.name) from None
+            _require_usable(cell, entry)
             if entry.topics:
                 wire_service(cell, entry)
+
+
+def _require_usable(cell: Cell, entry: ServiceEntry) -> None:
+    _, config = load_service(cell, entry)
+    try:
+        config.require_usable()
+    except ConfigError as problem:
+        raise located(problem, config, entry.name) from None
 
 
 def require_task(cell: Cell) -> None:
@@ -338,6 +342,7 @@ def wiring(cell: Cell) -> Iterator[Finding]:
                     f"name one of {', '.join(cell.services)}")
     for entry in cell.services.values():
         try:
+            _require_usable(cell, entry)
             each = wire_service(cell, entry)
         except ConfigError as problem:
             yield refusal(problem)

@@ -75,6 +75,9 @@ def _visibility(
                           f"correct position, rpy or fx, fy of {field}")
     for item in placed:
         corners = _corners(item, solids[item.id])
+        x, y = corners[:, :2].mean(axis=0)
+        if any(belt.speed and belt.carries(x, y, corners[:, 2].min()) for belt in world.conveyors.values()):
+            continue  # it starts where the belt comes from
         seen_by = {name: float(_visible(camera, corners).mean()) for name, camera in cameras.items()}
         best = max(seen_by.values())
         if best < 1:

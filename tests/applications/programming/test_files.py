@@ -49,6 +49,8 @@ def test_program_is_written_as_it_was_read_and_every_step_has_an_id() -> None:
     ("steps:\n  - {step: loop, steps: [{step: move, to: home},\n      {step: wait, for: {signa: x}}]}",
      ":3: steps[0].steps[1].for.signa: 'x' is not a field; choices: above, below, holding, outcome, signal, value"),
     ("steps:\n  - {step: wait}", ":2: steps[0]: a wait has exactly one of seconds, for"),
+    ("steps:\n  - {step: until, force: 5, direction: [0, 0, 0]}",
+     ":2: steps[0].direction: must not be 0 along all axes"),
     ("steps:\n  - {step: grip, width: 2}", ":2: steps[0].width: 2 must be less than or equal to 0.2"),
     ("steps:\n  - {step: move, id: a, to: home}\n  - {step: move, id: a, to: home}",
      ": id: 'a' is given to several steps; each needs its own"),
