@@ -217,6 +217,7 @@ class Summary:
             "figures": dict(self.status.figures),
             "overlooked": self.status.overlooked,
             "unexplained": self.unexplained,
+            **({"problem": self.status.message} if self.state == "ERROR" and self.status.message else {}),
             **({"continued": self.continued} if self.continued else {}),
             **self.figures.blocks(),
             **({"chaos": list(self.chaos)} if self.chaos is not None else {}),
@@ -239,6 +240,8 @@ def describe(summary: dict[str, Any], application: Figures) -> list[str]:
     """
     seconds = summary["seconds"]
     lines = [f"{summary['cell']}: {summary['state']}, {application.headline(summary)}"]
+    if summary.get("problem"):
+        lines.append(f"  {summary['problem']}")
     if summary["figures"]:
         lines.append("  " + ", ".join(f"{name} {value}" for name, value in summary["figures"].items()))
     for place in summary["rejected"]:

@@ -51,6 +51,14 @@ def test_summary_has_the_fields_that_scripts_read():
     json.dumps(summary)
 
 
+@pytest.mark.parametrize(("state", "problem"), [("ERROR", "lid: is out of reach"), ("DONE", None)])
+def test_reason_of_an_error_is_part_of_the_summary(state, problem):
+    summary = Summary("panda", 0, 1.0)
+    summary.on_status(status(state, 10, message="lid: is out of reach"))
+    assert summary.as_dict().get("problem") == problem
+    assert ("  lid: is out of reach" in describe(summary.as_dict(), Figures())) == (problem is not None)
+
+
 @pytest.mark.parametrize(("state", "moved", "listed"), [("DONE", False, 1), ("DONE", True, 0), ("ERROR", False, 0)])
 def test_finished_world_of_an_earlier_run_is_named(state, moved, listed):
     summary = Summary("panda", 0, 1.0)
