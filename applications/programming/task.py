@@ -264,7 +264,7 @@ class ProgramTask(Task[View]):
             self._finish(FAILED)
             return
         self.at.repeated, self.at.in_step, self.status.outcome = True, False, FAILED
-        self.end("ERROR", f"{where}: {problem}")
+        self.end("ERROR", f"{where}: {problem.removeprefix(f'{step.id}: ')}")  # a planner names the request, too
 
     def _drop_all(self) -> None:
         self.clear()
