@@ -36,6 +36,7 @@ TOOL = "zencell"
 CONNECT_TIMEOUT = 2.0  # [s] to reach the router
 PROBE_TIMEOUT, PROBE_PERIOD = 0.5, 0.1  # [s] to connect to the router's port, and between two attempts
 TOKENS_TIMEOUT = 3.0  # [s] for readiness tokens: a busy host may stall for a second
+CELL_PROBES = 10  # for the first service of a cell
 QUERY_TIMEOUT = 1.0  # [s] for the value of a state
 
 
@@ -117,7 +118,7 @@ async def joined(
                     cell="_", service=TOOL, endpoint=endpoint, timeout=CONNECT_TIMEOUT, identity=identity,
                     secure=secure,
                 ) as bus:
-                    cell = _only({name for name, _ in await ready_services(bus)}, endpoint)
+                    cell = _only(await _ready_cells(bus), endpoint)
             bus = await stack.enter_async_context(connect_to(
                 cell=cell or "_", service=TOOL, endpoint=endpoint, clock=Clock.from_environment(),
                 timeout=CONNECT_TIMEOUT, identity=identity, remapped=remapped,
@@ -165,6 +166,15 @@ def _only(cells: set[str], endpoint: str) -> str:
     if len(cells) > 1:
         raise SeveralCellsRunning(cells)
     return cells.pop()
+
+
+async def _ready_cells(bus: Bus) -> set[str]:
+    """Return the cells with a ready service, as soon as there is one: a busy router may be late."""
+    for _ in range(CELL_PROBES):
+        if found := {cell for cell, _ in await ready_services(bus)}:
+            return found
+        await asyncio.sleep(PROBE_PERIOD)
+    return set()
 
 
 async def ready_services(bus: Bus) -> list[tuple[str, str]]:

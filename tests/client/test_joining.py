@@ -83,6 +83,23 @@ async def test_only_running_cell_is_joined_and_one_of_several_must_be_named(net:
                 assert cell.name == "bert"
 
 
+async def test_cell_that_becomes_ready_meanwhile_is_joined(net: LocalNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, ask = asyncio.Event(), joining.ready_services
+
+    async def asked(bus: Bus) -> list[tuple[str, str]]:
+        found = await ask(bus)
+        first.set()
+        return found
+
+    monkeypatch.setattr(joining, "ready_services", asked)
+    joined = asyncio.create_task(Cell().__aenter__())
+    await first.wait()
+    async with publishing(net, None, cell="anna"):
+        cell = await joined
+        assert cell.name == "anna"
+        await cell.__aexit__(None, None, None)
+
+
 async def test_cell_is_found_in_another_domain_only_if_it_is_the_only_one(
     net: LocalNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from applications.sorting.learning.card import auc, calibration
-from applications.sorting.learning.evaluate import Trial, mcnemar, table, wilson
 from applications.sorting.learning.network import MAX_BYTES, Network
 from applications.sorting.learning.patches import SIZE, STEP
 from applications.sorting.learning.train import Split, platt
 from applications.sorting.learning.tries import Tries
 from common.errors import ConfigError
+
+pytest.importorskip("mujoco", reason="make setup EXTRAS=physics")
+from applications.sorting.learning.evaluate import Trial, mcnemar, table, wilson  # noqa: E402
 
 
 def tries(count: int = 40, seed: int = 0) -> Tries:
