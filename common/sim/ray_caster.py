@@ -245,8 +245,8 @@ def _antialias(pixels: Array, plane: Array, colors: Pixels, meshes: Ints, colour
         near = plane[of, 0] * u + plane[of, 1] * v + plane[of, 2]
         covered = (side >= reach[of] - SLACK).all(axis=1)
         np.maximum.at(least, at[covered], (near - tilt[of])[covered])
-        kept = (side >= -reach[of] - SLACK).all(axis=1) & (near + tilt[of] >= least[at])
-        of, at, side, near = of[kept], at[kept], side[kept], near[kept]
+        possible = (side >= -reach[of] - SLACK).all(axis=1) & (near + tilt[of] >= least[at])
+        of, at, side, near = of[possible], at[possible], side[possible], near[possible]
         inside = np.ones((len(of), SAMPLES), bool)
         for k in range(3):
             inside &= side[:, k, None] + inward[of, k] @ offsets.T >= -SLACK
