@@ -140,8 +140,9 @@ class FakeBrowser:
         await self.set(label, label if group_labels else True)
 
     async def send_viser(self, message: dict[str, Any]) -> None:
-        """Send a message to viser."""
+        """Send a message to viser, and wait until it arrived: the next press uses the other connection."""
         await self._connection.send(msgspec.msgpack.encode(message))
+        await asyncio.wait_for(await self._connection.ping(), PATIENCE)
 
 
 @asynccontextmanager

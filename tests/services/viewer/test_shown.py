@@ -44,7 +44,7 @@ async def test_state_and_counters_are_shown(panda: FakeServices, page: FakeBrows
     panda.put_motion(state="active", progress=0.5, held=True)
     await page.until(lambda: 'data-held="True"' in page.text and "pre grasp" in page.text)
     await page.until(lambda: "Paused" in page.text and "Press Resume to continue." in page.text)
-    assert "<b>2 of 7</b>" in page.text
+    await page.until(lambda: "<b>2 of 7</b>" in page.text)
     panda.put_motion(state="active", progress=0.5)
     await page.until(lambda: "Grasping track 4" in page.text and "arm moving, 50 % of this motion" in page.text)
 
