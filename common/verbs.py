@@ -63,11 +63,13 @@ class BeforeRun:
     """Name or path of the cell to run instead of the given file; empty: that is the cell."""
     after: Callable[[], None] | None = None
     """Called after the end of the run, also after Ctrl-C."""
+    check: Callable[[], None] | None = None
+    """Called by `run` before anything starts; raises what would make its task fail."""
 
     def following(self, before: BeforeRun) -> BeforeRun:
         """Return this, with what an earlier hook has set and this one has not."""
         return BeforeRun(self.overrides, self.first or before.first, self.cell or before.cell,
-                         self.after or before.after)
+                         self.after or before.after, self.check or before.check)
 
     def changed(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return the options of the run with its cell and overrides."""

@@ -130,19 +130,25 @@ def report(rehearser: Rehearser) -> list[str]:
     return lines
 
 
-def problems(rehearser: Rehearser) -> list[str]:
-    """Return the problems of a dry run in lines with file, line and step; each step once."""
+def problems(rehearser: Rehearser, *, certain: bool = False) -> list[str]:
+    """Return the problems of a dry run in lines with file, line and step; each step once.
+
+    Args:
+        rehearser: at the end of the dry run.
+        certain: only those that end the program, whatever it meets on its way.
+    """
     found: dict[str, None] = {}
     for item in rehearser.result.steps:
-        if item.problem:
-            file = rehearser.flow.files[item.program]
+        file = rehearser.flow.files[item.program]
+        may_succeed = item.unknown or file.steps[item.step].on_failure == "continue"
+        if item.problem and not (certain and may_succeed):
             found[f"{file.path}:{file.lines.get(item.step, 0)}: {item.step}: {item.problem}"] = None
     return list(found)
 
 
-def require_no_problems(rehearser: Rehearser) -> None:
-    """Raise all problems of a dry run. Raises BadProgram."""
-    if found := problems(rehearser):
+def require_no_problems(rehearser: Rehearser, *, certain: bool = False) -> None:
+    """Raise all problems of a dry run; arguments as of `problems`. Raises BadProgram."""
+    if found := problems(rehearser, certain=certain):
         raise BadProgram(found)
 
 

@@ -35,6 +35,14 @@ def static_problems(file: ProgramFile, cell: Cell, io: Io) -> Iterator[tuple[Bas
             yield step, f"{place}.{field}: {problem}"
 
 
+def _problem_of_goal(response: m.PlanResponse) -> str:
+    """Return why the goal of a plan cannot be reached from any start; empty: it may be."""
+    if response.error == "out_of_reach":
+        return response.message
+    return next((each.message for each in response.attempts
+                 if each.error in ("no_ik", "goal_in_collision") and each.waypoint is None), "")
+
+
 def _wrong(step: BaseStep, file: ProgramFile, cell: Cell, io: Io) -> Iterator[tuple[str, str]]:
     for key, target in step.targets():
         if target.by is None:
@@ -112,21 +120,26 @@ class Rehearser:
         self._visited.add(step.id)
         self.result.step = step.id
         item = RehearsedStep(program=file.name, step=step.id, kind=step.step)
+        certain = False  # the problem does not depend on the start of the step
         if problem := self._wrong.get(step.id, ""):
-            item.problem = problem
-            self._lost = self._lost or step.id
+            item.problem, self._lost = problem, step.id
+            certain = True
         elif step.UNKNOWN:
             item.unknown, self._lost = step.UNKNOWN, self._lost or (step.id if step.ENDS_ANYWHERE else "")
         elif isinstance(step, Wait) and step.seconds is not None:
             item.seconds = step.seconds
         else:
-            yield from self._plan(step, file, item)
-        after = f"begins after {self._lost}, whose end is not known" if self._lost not in ("", step.id) else ""
-        item.unknown = "; ".join(each for each in (item.unknown, assumed, after) if each)
+            certain = yield from self._plan(step, file, item)
+        if not certain:
+            after = f"begins after {self._lost}, whose end is not known" if self._lost not in ("", step.id) else ""
+            item.unknown = "; ".join(each for each in (item.unknown, assumed, after) if each)
         self.result.seconds += item.seconds or 0.0
         self.result.steps.append(item)
 
-    def _plan(self, step: BaseStep, file: ProgramFile, item: RehearsedStep) -> Planning:
+    def _plan(
+        self, step: BaseStep, file: ProgramFile, item: RehearsedStep,
+    ) -> Generator[m.PlanRequest, m.PlanResponse, bool]:
+        """Plan the motions of a step; return whether a problem does not depend on its start."""
         main = self.flow.files[self.flow.main].program
         view = replace(self._view, scene=self.scene)
         try:
@@ -135,16 +148,19 @@ class Rehearser:
         except NotSeen as error:
             item.unknown, self._lost = str(error), self._lost or step.id
             self._now = replace(self._now, holding=isinstance(step, Pick))
-            return
+            return False
         except ZencellError as error:
             item.problem, self._lost = str(error)[:500], self._lost or step.id
-            return
-        seconds, unknown = 0.0, ""
+            return False
+        seconds, unknown, certain = 0.0, "", False
         for stage in built.stages:
             if isinstance(stage, ProgramMove):
                 response = yield self._request(stage)
                 if response.trajectory is None or not response.ok:
-                    item.problem, self._lost = response.message[:500], self._lost or step.id
+                    of_goal = _problem_of_goal(response)
+                    item.problem = (of_goal or response.message).removeprefix(f"{stage.name}: ")[:500]
+                    self._lost = self._lost or step.id
+                    certain = bool(of_goal) and {target.by is None for _, target in step.targets()} == {True}
                     if isinstance(goal := stage.goal, m.JointGoal):
                         self._q = list(goal.positions or self.cell.robot.config.named_poses[goal.named])
                     break
@@ -161,6 +177,7 @@ class Rehearser:
                 unknown = f"the wait for {stage.condition}"
         item.seconds, item.unknown = (None if unknown else seconds), unknown
         self._now = replace(built.after, T_world_tcp=self.cell.robot.fk(self._q))
+        return certain
 
     def _request(self, move: ProgramMove) -> m.PlanRequest:
         self.planned += 1

@@ -21,7 +21,8 @@ class RehearsedStep(Message):
     step: Label = Field(description="id")
     kind: Label = Field(description="move, grip, ...")
     seconds: Seconds | None = Field(None, description="planned duration, cell time; None: not known")
-    unknown: Remark = Field("", description="what the duration depends on, if it is not known, or not exact")
+    unknown: Remark = Field("", description="what the duration depends on, if it is not known, or not exact; "
+                                       "with a problem, what the problem depends on")
     problem: Remark = Field("", description="why it cannot run: no path, unknown pose, missing signal")
 
 

@@ -110,23 +110,27 @@ def before_run(cell: str, overrides: list[str], world: str | None, *, on: RunIn 
         if on:
             raise ConfigError("--cell", on, f"is for a program, and {cell!r} is a cell")
         return BeforeRun(overrides)
+    from applications.programming import offline
     from applications.programming.files import load_program
-    from applications.programming.offline import cell_of, is_program, overrides_for
 
-    if not is_program(cell):
+    if not offline.is_program(cell):
         if on:
             raise ConfigError("--cell", on, f"is for a program, and {cell!r} is none: it has no steps")
         return BeforeRun(overrides)
     file = load_program(Path(cell).expanduser())
-    name = cell_of(file, on)
-    own, progress = overrides_for(file, name, tuple(overrides))
+    name = offline.cell_of(file, on)
+    own, progress = offline.overrides_for(file, name, tuple(overrides))
+
+    def check_motions() -> None:
+        found = offline.rehearse(file.path, name, tuple(overrides), everything=True)
+        offline.require_no_problems(found, certain=True)
 
     def forget() -> None:
         """The operator has ended the run: the next one begins at the first step."""
         for each in progress.parent.glob(f"{progress.name}*"):  # also the files that replace it
             each.unlink(missing_ok=True)
 
-    return BeforeRun([*own, *overrides], cell=name, after=forget)
+    return BeforeRun([*own, *overrides], cell=name, after=forget, check=check_motions)
 
 
 VERBS = Verbs(

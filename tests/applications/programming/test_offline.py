@@ -15,7 +15,7 @@ from applications.programming.files import BadProgram, load_program
 from applications.programming.flow import Flow, Undecided
 from applications.programming.form import Known, fields_of, new_step
 from applications.programming.model import STEPS, Distance, Motion
-from applications.programming.offline import rehearse
+from applications.programming.offline import rehearse, require_no_problems
 from applications.programming.targets import backed, pose_goal
 from tests.harness import ask
 
@@ -64,6 +64,34 @@ def test_check_reports_all_problems_at_once_each_with_line_and_step(tmp_path: Pa
         "9: inside: "), strict=True):
         assert line.startswith(start), line
     assert "reach" in lines[3] and "collides with table" in lines[4], "reach, and the straight motion before contact"
+
+
+UNSURE = """\
+steps:
+  - {step: pick, kind: ball}
+  - {step: retreat, distance: 1.5}
+  - {step: move, to: {position: [1.5, 0, 0.3]}, on_failure: continue}
+"""
+
+
+@pytest.mark.parametrize(("more", "refused"), [
+    ("  - {step: move, to: {position: [1.5, 0, 0.3]}}", "5: move2: no pose of the goal region can be reached"),
+    ("  - {step: place, at: {position: [0.5, 0, -0.1]}}", "5: place1: all "),
+    ("  - {step: if, when: {holding: false}, then: [{step: output, signal: clam}]}", "5: output1: steps[3].then[0]"),
+    ("", ""),
+])
+def test_run_refuses_what_fails_wherever_the_program_is_and_nothing_else(
+    tmp_path: Path, more: str, refused: str,
+) -> None:
+    file = written(tmp_path, UNSURE + more)
+    if not refused:
+        with pytest.raises(BadProgram):
+            require_no_problems(rehearse(Path(file), CELL, everything=True))
+        require_no_problems(rehearse(Path(file), CELL, everything=True), certain=True)
+        return
+    done = ask(tmp_path, "run", file, "--cell", CELL)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith(f"zencell: {file}:{refused}"), done.stderr
 
 
 def test_dry_run_sums_the_durations_and_says_what_is_not_known(tmp_path: Path) -> None:
