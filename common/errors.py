@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
+from typing import Any
 
 MAX_SHOWN = 120  # characters of a value
 
@@ -30,6 +31,22 @@ class ConfigError(ZencellError):
     def within(self, section: str) -> ConfigError:
         """Return the same error with the section of the cell that its field is in."""
         return ConfigError(f"{section}.{self.field}", self.value, self.expected)
+
+
+def expected_text(error: Mapping[str, Any]) -> str:
+    """Return what is expected instead of a value, from an item of pydantic's `ValidationError.errors()`."""
+    limits = error.get("ctx", {})
+    match error["type"]:
+        case "too_short":
+            return f"must have at least {limits['min_length']} of them"
+        case "too_long":
+            return f"must have at most {limits['max_length']} of them"
+        case "model_type" | "dict_type":
+            return "must be a mapping"
+        case "list_type":
+            return "must be a list"
+    text: str = error["msg"].removeprefix("Value error, ").partition(", unable to parse")[0]
+    return text.replace("Input should be", "must be").replace("String should", "must").replace("Input ", "")
 
 
 class UnknownName(ZencellError):

@@ -11,7 +11,7 @@ from applications.outlining.solids import simplified, without_duplicates
 from applications.outlining.stage_files import StageFileError, read_coordinates
 from applications.outlining.topics import CONTOUR_PATH, CONTOUR_POINTS, OutlinePoints
 from common.config import Parameters, Tunable
-from common.errors import ConfigError
+from common.errors import ConfigError, expected_text
 from common.messages import Pose, Vector3
 from common.messages.basics import MAX_NAME
 from common.process.service import main
@@ -51,7 +51,7 @@ def points_of(file: Path) -> list[Pose]:
     except StageFileError as error:
         raise ConfigError("services.duplicate_remover.coordinates", ..., str(error)) from None
     except ValidationError as error:
-        problem = error.errors(include_url=False)[0]["msg"]
+        problem = expected_text(error.errors(include_url=False)[0])
         raise ConfigError("services.duplicate_remover.coordinates", ..., f"{file}: {problem}") from None
 
 

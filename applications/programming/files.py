@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import count
@@ -19,7 +18,7 @@ from applications.programming.model import BaseStep, Program, as_data, walk
 from applications.programming.steps import Call
 from common.atomic_file import write_atomically
 from common.config import parse_yaml
-from common.errors import ConfigError, UnknownName, ZencellError
+from common.errors import ConfigError, UnknownName, ZencellError, expected_text
 
 SUFFIX = ".yaml"
 MAX_BYTES = 1_000_000
@@ -95,10 +94,15 @@ def parse_program(text: str, path: Path) -> ProgramFile:
     try:
         program = Program.model_validate(tree)
     except ValidationError as error:
-        raise BadProgram([_problem(path, lines, each) for each in error.errors(include_url=False)]) from None
-    twice = [id_ for id_, times in Counter(step.id for _, step in walk(program.steps) if step.id).items() if times > 1]
-    if twice:
-        raise BadProgram([f"{path}: id: {twice[0]!r} is given to several steps; each needs its own"])
+        raise BadProgram(_problems(path, lines, error.errors(include_url=False))) from None
+    first: dict[str, int] = {}  # lines of ids
+    for place, step in walk(program.steps):
+        line = lines.get(place, 0)
+        if step.id in first:
+            raise BadProgram([f"{path}:{line}: {place}.id: {step.id!r} is also the id of the step in line "
+                              f"{first[step.id]}; each needs its own"])
+        if step.id:
+            first[step.id] = line
     program = with_ids(program)
     found = {step.id: lines[place] for place, step in walk(program.steps) if place in lines}
     return ProgramFile(path.stem, path, program, found)
@@ -168,19 +172,26 @@ def _lines(node: yaml.Node | None, place: str = "") -> Iterator[tuple[str, int]]
             yield from _lines(value, f"{place}[{number}]")
 
 
-def _problem(path: Path, lines: Mapping[str, int], error: Mapping[str, Any]) -> str:
-    """Return one validation error as a line with file, line, path of the field, value and choices."""
-    place = ""
-    for part in error["loc"]:
-        if isinstance(part, int):
-            place += f"[{part}]"
-        elif "-" not in part and not part.endswith("]"):  # not a branch of a union, such as constrained-float
-            place = f"{place}.{part}".lstrip(".")
+def _problems(path: Path, lines: Mapping[str, int], errors: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return validation errors in lines with file, line, path of the field, value and choices; one for each field."""
+    by_place: dict[str, list[Mapping[str, Any]]] = {}
+    for error in errors:
+        place = ""
+        for part in error["loc"]:
+            if isinstance(part, int):
+                place += f"[{part}]"
+            elif "-" not in part and not part.endswith("]"):  # not a branch of a union, such as constrained-float
+                place = f"{place}.{part}".lstrip(".")
+        by_place.setdefault(place, []).append(error)
+    return [_problem(path, lines, place, found[0], ", or ".join(map(expected_text, found)))
+            for place, found in by_place.items()]
+
+
+def _problem(path: Path, lines: Mapping[str, int], place: str, error: Mapping[str, Any], text: str) -> str:
     known = place
     while known and known not in lines:
         known = known[: max(known.rfind("."), known.rfind("["), 0)]
     where = f"{path}:{lines[known]}" if known else str(path)
-    text = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("Input ", "")
     if error["type"] == "missing":
         return f"{where}: {place}: is missing"
     if error["type"] == "value_error":

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, Union, get_args, get_origi
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from common.errors import ConfigError
+from common.errors import ConfigError, expected_text
 from common.remapping import is_key
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -95,9 +95,9 @@ def check(model: type[C], values: Mapping[str, Any], prefix: str = "") -> C:
 
 
 def _first_error(error: ValidationError, model: type[BaseModel], prefix: str) -> ConfigError:
-    first = error.errors(include_url=False, include_context=False)[0]
+    first = error.errors(include_url=False)[0]
     field = ".".join(part for part in [prefix, *(str(p) for p in first["loc"])] if part)
-    message = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be").replace("Input ", "")
+    message = expected_text(first)
     if first["type"] == "extra_forbidden":
         names = _fields_at(model, first["loc"][:-1])
         choices = f"choices: {', '.join(names)}" if names else "there are none here"

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgpack
 from pydantic import ValidationError
 
-from common.errors import DecodeError
+from common.errors import DecodeError, expected_text
 from common.messages import SCHEMA_VERSION, Message
 from common.messages.basics import MAX_PAYLOAD_BYTES, MAX_STAMP, SMALL_BYTES, clean, is_name
 from common.time_source import new_id
@@ -159,10 +159,10 @@ def _unpack(payload: bytes, limit: int, name: str, parts: int = 64, in_pieces: b
 
 
 def _first_error(error: ValidationError, name: str) -> str:
-    errors = error.errors(include_url=False, include_context=False)
+    errors = error.errors(include_url=False)
     first = errors[0]
     field = ".".join([name, *(str(part) for part in first["loc"])])
-    reason = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    reason = expected_text(first)
     if first["type"] == "string_pattern_mismatch":  # messages have no other pattern
         reason = "must be a name without control characters"
     given = "" if first["type"] in ("missing", "value_error") else f", not {_shown(first['input'])}"

@@ -36,7 +36,7 @@ def test_program_is_written_as_it_was_read_and_every_step_has_an_id() -> None:
     ("steps: [}", ":1: does not parse: expected the node content, but found '}'"),
     ("steps:\n  - {step: move, to: {joints: [1.0e+308]}}",
      ":2: steps[0].to.joints[0]: 1e+308 must be less than or equal to 1000"),
-    ("steps: []", ":1: steps: [] List should have at least 1 item after validation, not 0"),
+    ("steps: []", ":1: steps: [] must have at least 1 of them"),
     ("cell: panda", ": steps: is missing"),
     ("steps:\n  - {step: move}", ":2: steps[0].to: is missing"),
     ("steps:\n  - {step: mov, to: home}", f":2: steps[0].step: 'mov' is not a step; choices: {', '.join(STEPS)}"),
@@ -51,9 +51,15 @@ def test_program_is_written_as_it_was_read_and_every_step_has_an_id() -> None:
     ("steps:\n  - {step: wait}", ":2: steps[0]: a wait has exactly one of seconds, for"),
     ("steps:\n  - {step: until, force: 5, direction: [0, 0, 0]}",
      ":2: steps[0].direction: must not be 0 along all axes"),
-    ("steps:\n  - {step: grip, width: 2}", ":2: steps[0].width: 2 must be less than or equal to 0.2"),
+    ("steps:\n  - {step: grip, width: 2}",
+     ":2: steps[0].width: 2 must be less than or equal to 0.2, or must be 'open' or 'close'"),
     ("steps:\n  - {step: move, id: a, to: home}\n  - {step: move, id: a, to: home}",
-     ": id: 'a' is given to several steps; each needs its own"),
+     ":3: steps[1].id: 'a' is also the id of the step in line 2; each needs its own"),
+    ("steps: [{step: move, id: a, to: home}, {step: move, id: a, to: home}]",
+     ":1: steps[1].id: 'a' is also the id of the step in line 1; each needs its own"),
+    ("steps: 5", ":1: steps: 5 must be a list"),
+    ("speed: fast\nsteps: []", ":1: speed: 'fast' must be a valid number"),
+    ("poses: {bin: 3}\nsteps: []", ":1: poses.bin: 3 must be a mapping"),
 ])
 def test_error_names_file_line_step_field_and_choices(text: str, problem: str) -> None:
     with pytest.raises(BadProgram) as raised:
