@@ -73,11 +73,11 @@ class RawClient:
         self._declarations.append(self._session.declare_queryable(key, direct(reply)))
         return received
 
-    def query(self, key: str, payload: bytes | None = None, *, timeout: float = 2.0) -> list[bytes]:
-        """Return the replies, error replies included, of all queryables of the key."""
+    def query(self, key: str, payload: bytes | None = None, *, timeout: float = TIMEOUT) -> list[bytes]:
+        """Return the replies, error replies included, of all queryables of the key; at once when all have replied."""
         return self.query_all([key], payload, timeout=timeout)
 
-    def query_all(self, keys: Iterable[str], payload: bytes | None = None, *, timeout: float = 2.0) -> list[bytes]:
+    def query_all(self, keys: Iterable[str], payload: bytes | None = None, *, timeout: float = TIMEOUT) -> list[bytes]:
         """Return the replies to simultaneous queries."""
         queries = [self._session.get(key, payload=payload, timeout=timeout, target=zenoh.QueryTarget.ALL,
                                      consolidation=zenoh.ConsolidationMode.NONE) for key in keys]
@@ -88,8 +88,8 @@ class RawClient:
     def declare_token(self, token: str) -> None:
         self._declarations.append(self._session.liveliness().declare_token(token))
 
-    def tokens(self, key: str) -> list[str]:
-        return [str(reply.ok.key_expr) for reply in self._session.liveliness().get(key, timeout=2.0) if reply.ok]
+    def tokens(self, key: str, *, timeout: float = TIMEOUT) -> list[str]:
+        return [str(reply.ok.key_expr) for reply in self._session.liveliness().get(key, timeout=timeout) if reply.ok]
 
     def watch_tokens(self, key: str) -> Received:
         received = Received()

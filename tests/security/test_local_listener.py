@@ -22,7 +22,7 @@ from tests.domains import free_port
 from tests.security.raw_client import REFUSAL_MS, RawClient, issue
 
 SILENT = 150  # Zenoh without the gate accepts no client for 100 ms after each
-WITHIN = 3.0  # [s]
+WITHIN = 10.0  # [s] less than those 15 s, though a loaded machine takes seconds
 
 
 class SecuredRouter:
