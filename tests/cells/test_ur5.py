@@ -14,7 +14,7 @@ import pytest
 
 from applications.outlining import stage_files
 from applications.outlining.topics import CONTOUR_PATH, CONTOURS, OUTLINE_STATUS
-from tests.harness import Place, RunningCell, ask, command_line, environment, free_domain, until
+from tests.harness import PATIENCE, Place, RunningCell, ask, command_line, environment, free_domain, until
 
 pytestmark = [pytest.mark.cell, pytest.mark.slow]
 
@@ -65,7 +65,7 @@ def test_missing_object_is_rejected_with_choices_and_another_is_selected(up: Run
 
     asyncio.run(start())
     up.interrupt()
-    assert asyncio.run(up.ended(10)) == 0
+    assert asyncio.run(up.ended(PATIENCE)) == 0
     assert up.summary["outline"]["object"] == label
 
 

@@ -8,7 +8,6 @@ import pytest
 from tests.harness import ask
 
 RUNNING = "zenoh --mode client"  # the last line of `up` when all services are ready
-GONE = 3.0  # [s] after its supervisor was killed
 
 
 def test_services_start_in_order_and_stop_in_reverse_and_the_port_is_theirs(zencell, folder):
@@ -91,7 +90,7 @@ def test_killed_supervisor_leaves_no_process_not_even_a_frozen_one(zencell):
     command.until(RUNNING)
     command.children()["middle"].send_signal(signal.SIGSTOP)
     command.process.kill()
-    command.until_childless(GONE)
+    command.until_childless()
 
 
 @pytest.mark.parametrize(("behaviour", "code", "state"), [

@@ -55,7 +55,8 @@ def wait_for(path: Path, topic: str = "", messages: int = 1) -> None:
 def test_recording_ended_by_ctrl_c_is_complete_from_the_first_state_on(place):
     command = record(place, "all.mcap")
     wait_for(place.folder / "all.mcap", IMAGE, 5)
-    wait_for(place.folder / "all.mcap", "counters/talker")  # published once a second
+    for topic in ("counters/talker", "pick_place_status", "supervisor/status"):  # published once a second
+        wait_for(place.folder / "all.mcap", topic)
     command.interrupt()
     assert command.end() == 0, command.lines
     assert any(line.startswith("recorded ") and line.endswith(": all.mcap") for line in command.lines)
@@ -76,7 +77,7 @@ def test_recording_ended_by_ctrl_c_is_complete_from_the_first_state_on(place):
 
 def test_selected_topics_are_recorded_for_a_duration(place):
     done = place.ask("record", IMAGE, "--regex", "^pick", "--exclude", "counters", "-o", "some.mcap",
-                     "--duration", "0.5")
+                     "--duration", "3")  # states are repeated each second
     assert done.returncode == 0, done.stderr
     shown = json.loads(ask(place.folder, "info", "some.mcap", "--json").stdout)
     assert set(shown["topics"]) == {IMAGE, "pick_place_status"} and shown["run"]["seed"] == 5
