@@ -136,7 +136,7 @@ async def test_arm_is_stopped_and_task_started_under_remapped_keys(net: LocalNet
         assert await joining.newest_interlock(right.bus) == stopped.newest, "of all arms"
         assert left.bus.full_key(await left.task.topic()) == "two_arms/left/pick_place_status"
         await left.task.start()
-        async with asyncio.timeout(5.0):
+        async with asyncio.timeout(60.0):
             while (await left.arm.status()).stopped:  # noqa: ASYNC110 - the task passes the start on to the executor
                 await asyncio.sleep(0.01)
         for request in (right.arm.status(), right.services(), left.services()):

@@ -33,6 +33,7 @@ class Cell:
         self.requests: list[m.Message] = []
         self.executing = asyncio.Event()
         self.plan_error, self.refusal, self.ends = "", ("", ""), True
+        self.begins: dict[str, object] = {}  # further fields of the first status of a motion
         self.during_planning: Callable[[], object] = lambda: None
         self.bus.serve(topics.MOTION_PLAN, self.plan)
         self.bus.serve(topics.MOTION_EXECUTE, self.execute)
@@ -63,7 +64,7 @@ class Cell:
         self.executing.set()
         if self.refusal[0]:
             return m.MotionStatus(id=request.id, state="rejected", error=self.refusal[0], message=self.refusal[1])
-        answer = self.publish(id=request.id, state="active")
+        answer = self.publish(id=request.id, state="active", **self.begins)
         if self.ends:
             self.publish(state="succeeded", progress=1.0)
         return answer
@@ -239,6 +240,7 @@ async def test_any_error_while_waiting_stops_the_robot(cell, operator, monkeypat
 
 
 async def test_motion_without_progress_is_stopped_but_not_while_held(cell: Cell, operator: OperatorMotion) -> None:
+    cell.begins = {"held": True}
     moving = await cell.motion_of(operator, timeout=0.05)
     cell.publish(held=True)
     _, waiting = await asyncio.wait({moving}, timeout=0.2)
