@@ -76,11 +76,13 @@ class Cell(FakeCell):
         self.put_joints(ROBOT.joint_names, START, stamp)
         self.put(topics.SCENE_OBJECTS, m.WorldObjects(objects=[world_object(item) for item in objects]))
 
-    async def new_image(self, reader: Any) -> None:
-        """Wait for an image taken from now on, and publish a joint state at its time."""
-        now = self.clock.now_ns()
-        image = await until(reader, lambda image: image.header.stamp >= now)
-        self.put_joints(ROBOT.joint_names, START, image.header.stamp)
+    async def last_image(self, cloud: bool = False, *objects: ObjectConfig) -> None:
+        """Run the camera for an image of objects, and publish a joint state at its time: no later image comes."""
+        reader, now = self.clouds if cloud else self.depths, self.clock.now_ns()
+        async with self.running(depth_camera, CAMERA):
+            self.show(*objects)
+            await until(reader, lambda image: image.header.stamp >= now)
+        self.put_joints(ROBOT.joint_names, START, reader.latest.header.stamp)
 
     async def refusal(self) -> RemoteError:
         with pytest.raises(RemoteError) as caught:
@@ -95,16 +97,14 @@ async def test_obstacle_that_only_the_camera_sees_is_avoided(camera: dict[str, s
     post = m.CollisionObject(id="post", role="fixture", shape="box", dimensions=[0.08, 0.08, 0.25],
                            pose=at(0.5, 0, 1.125))
     world = CollisionWorld(ROBOT, SCENE.model_copy(update={"objects": [*SCENE.objects, post]}), start=START)
-    async with cell.running(depth_camera, CAMERA):
-        for config in (PLANNER, with_points(cameras=[camera], **(UNKNOWN if "depth" in camera else {}))):
-            async with cell.running(motion_planner, config):
-                await cell.plan.wait_available(20)
-                cell.show(POST)
-                await cell.new_image(cell.clouds if "points" in camera else cell.depths)
-                response = await cell.plan.call(ACROSS, timeout=60)
-                assert response.ok, response.message
-                path = interpolate(np.array([point.positions for point in response.trajectory.points]), 0.005)
-                collides.append(world.first_collision(path) is not None)
+    for config in (PLANNER, with_points(cameras=[camera], **(UNKNOWN if "depth" in camera else {}))):
+        async with cell.running(motion_planner, config):
+            await cell.plan.wait_available(20)
+            await cell.last_image("points" in camera, POST)
+            response = await cell.plan.call(ACROSS, timeout=60)
+            assert response.ok, response.message
+            path = interpolate(np.array([point.positions for point in response.trajectory.points]), 0.005)
+            collides.append(world.first_collision(path) is not None)
     assert collides == [True, False], "the post obstructs the path without points"
 
 
@@ -125,19 +125,18 @@ async def test_request_without_a_usable_image_is_refused_with_the_reason(planner
         await until(planner.depths)
         refusal = await planner.refusal()
         assert refusal.code == "no_state" and "no joint state at the time" in refusal.message
-        planner.put(topics.TF_STATIC, m.TFMessage(transforms=[stamped("world", "elsewhere", np.eye(4), 0)]))
-        await planner.new_image(planner.depths)
-        refusal = await planner.refusal()
-        assert refusal.code == "bad_points" and "depth_camera_optical_frame" in refusal.message
+    await planner.last_image()
+    planner.put(topics.TF_STATIC, m.TFMessage(transforms=[stamped("world", "elsewhere", np.eye(4), 0)]))
+    refusal = await planner.refusal()
+    assert refusal.code == "bad_points" and "depth_camera_optical_frame" in refusal.message
 
 
 async def test_old_image_is_refused() -> None:
     cell = Cell()
     config = with_points(cameras=[DEPTH], max_age=1e-6)
-    async with cell.running(motion_planner, config), cell.running(depth_camera, CAMERA):
+    async with cell.running(motion_planner, config):
         await cell.plan.wait_available(20)
-        cell.show()
-        await cell.new_image(cell.depths)
+        await cell.last_image()
         refusal = await cell.refusal()
         assert refusal.code == "old_points" and "limit points.max_age is 1e-06 s" in refusal.message
 
