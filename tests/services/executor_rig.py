@@ -48,7 +48,7 @@ class ExecutorClient(FakeCell):
         return m.ExecuteRequest(header=header, id=goal, trajectory=trajectory)
 
     async def start(self, goal, trajectory, stamp=None):
-        return await self.execute.call(self.request(goal, trajectory, stamp))
+        return await self.execute.call(self.request(goal, trajectory, stamp), timeout=60)
 
     async def ended(self, goal):
         return await latest(self.motion, lambda m: m.id == goal and m.state not in ("active", "rejected"))

@@ -67,15 +67,15 @@ async def test_stamps_follow_the_rate_in_cell_time():
         cell.place()
         stamps = [(await until(cell.images)).header.stamp for _ in range(6)]
         assert stamps == sorted(set(stamps)) and stamps[-1] <= cell.clock.now_ns()
-        # a grid of 0.1 s, less the jitter; multiples when frames were missed
-        assert np.median(np.diff(stamps)) > 0.05e9
+        # a grid of 0.1 s, less the delay of the first; multiples when frames were missed
+        assert stamps[-1] - stamps[0] > 0.4e9
 
 
 async def test_noise_depends_on_the_seed_of_the_run():
     async def first(seed):
         cell = Cell()
-        cell.place()
         async with cell.camera(run=Run(cell="test", seed=seed), noise_std=8, brightness=-20):
+            cell.place()  # only now, so that the first image is read
             return image_to_array(await until(cell.images))
 
     one, again, other = await first(1), await first(1), await first(2)

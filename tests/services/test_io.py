@@ -70,12 +70,14 @@ async def test_input_follows_an_output_and_a_pulse_starts_a_machine() -> None:
         assert (await fake.io.read("closed"), await fake.io.read("pressure")) == (False, 6.0)
         began = fake.bus.clock.now()
         assert (await fake.io.set("clamp")).value is True
-        assert await fake.io.wait("closed") is True
+        assert await fake.io.wait("closed") is True and await fake.io.read("closed") is True
         assert fake.bus.clock.now() - began >= 0.2
+        started = fake.bus.clock.now_ns()
         await fake.io.set("start", True)
-        assert await fake.io.read("busy") is True
         await fake.io.set("start", False)
         assert await fake.io.wait("busy", False) is False
+        pulse = (await fake.io.state()).find("busy").stamp - started
+        assert pulse >= 400_000_000, "its last change is the end of the pulse"
         assert await fake.io.wait("pressure", above=5.0, below=7.0) == 6.0
         with pytest.raises(SignalTimeout, match=r"pressure >= 8 was not seen within 0\.05 s"):
             await fake.io.wait("pressure", above=8.0, timeout=0.05)

@@ -14,13 +14,14 @@ from common.messages import CameraInfo, Header, JointState, WorldObjects
 from common.perception.camera_input import FrameError
 from common.perception.depth import depth_of
 from common.perception.pinhole import MountedCamera
+from common.process import camera_reader
 from common.process.camera_reader import CameraReader
 from common.robot.model import RobotModel
 from common.sim.rendering import Renderer
 from services import depth_camera, robot_state_publisher
 from tests.common.sim.spheres import spheres
 from tests.harness import running_with
-from tests.services.fake_cell import FakeCell, settle, until
+from tests.services.fake_cell import PATIENCE, FakeCell, settle, until
 
 SMALL = {"width": 64, "height": 48, "fx": 34, "fy": 34, "cx": 32, "cy": 24}
 CELL = load_cell(str(Path(__file__).parents[1] / "data" / "hand_camera.yaml"),
@@ -34,7 +35,8 @@ PUBLISHER = service_config(CELL, "robot_state_publisher", robot_state_publisher.
 MS = 1_000_000
 
 
-async def test_depth_of_a_mounted_camera_lies_on_the_table_at_any_pose() -> None:
+async def test_depth_of_a_mounted_camera_lies_on_the_table_at_any_pose(monkeypatch) -> None:
+    monkeypatch.setattr(camera_reader, "TF_TIMEOUT", PATIENCE)
     cell, stamp, q = FakeCell(), 0, HOME
     depths = cell.reader(topics.DEPTH_CAMERA_DEPTH)
     cell.put(topics.SCENE_OBJECTS, WorldObjects())
@@ -66,8 +68,9 @@ async def test_depth_of_a_mounted_camera_lies_on_the_table_at_any_pose() -> None
     assert np.abs(places[0] - places[1]).max() > 0.02, "it looked elsewhere"
 
 
-async def test_image_waits_for_its_transform_and_is_skipped_without_one() -> None:
+async def test_image_waits_for_its_transform_and_is_skipped_without_one(monkeypatch) -> None:
     cell = FakeCell()
+    monkeypatch.setattr(camera_reader, "TF_TIMEOUT", PATIENCE)
     moving, camera = cell.reader(topics.TF), CameraReader(cell.bus, AROUND)
     image = Header(stamp=1030 * MS, frame_id="camera_optical_frame")
     cell.put(topics.CAMERA_INFO, CameraInfo(header=image, width=64, height=48, d=[0.0] * 5,
@@ -81,6 +84,7 @@ async def test_image_waits_for_its_transform_and_is_skipped_without_one() -> Non
         cell.put_joints(ROBOT.joint_names, HOME + 0.02, 1060 * MS)
         found = await waiting
         np.testing.assert_allclose(found.T_world_optical, MOUNTED.at(HOME + 0.01).T_world_optical, atol=1e-4)
+        monkeypatch.setattr(camera_reader, "TF_TIMEOUT", 0.05)
         with pytest.raises(FrameError, match="tf has no pose of 'panda_link7' at the time of the image yet") as caught:
             await camera.of(image.model_copy(update={"stamp": 9000 * MS}))
         assert caught.value.kind == "early"

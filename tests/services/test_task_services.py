@@ -28,6 +28,7 @@ from tests.services.fake_cell import PATIENCE, FakeCell, at, ball, trajectory, u
 
 PANDA, UR5 = load_cell("panda"), load_cell("ur5")
 PICK_PLACE = service_config(PANDA, "smart_pick_place", smart_pick_place.Config)
+PICK_PLACE = PICK_PLACE.model_copy(update={"frame_timeout": 60.0})  # for a busy machine
 TRACER = service_config(UR5, "contour_tracer", contour_tracer.Config)
 SQUARE = [(0.45, -0.05), (0.55, -0.05), (0.55, 0.05), (0.45, 0.05)]
 
@@ -91,15 +92,15 @@ def show_ball(cell: FakeCell, age: float = 0.0) -> None:
     cell.put(VALIDATED_TARGETS, m.PoseArray(header=header, poses=[at(0.40, -0.17, 0.03)]))
 
 
-@pytest.mark.parametrize(("speed", "age"), [(1.0, 0.0), (10.0, 30.0)])
+@pytest.mark.parametrize(("speed", "age"), [(1.0, 0.0), (10.0, 300.0)])
 async def test_target_of_a_recent_image_causes_a_plan_request_above_the_ball(speed: float, age: float) -> None:
     """The timeout is in wall time, the age of an image in cell time."""
     cell = FakeCell(Clock(speed=speed))
     planned = cell.serve_planner()
     await cell.bus.ready()
-    async with cell.running(smart_pick_place, PICK_PLACE.model_copy(update={"frame_timeout": 10.0})):
+    async with cell.running(smart_pick_place, PICK_PLACE), asyncio.timeout(PATIENCE):
         show_ball(cell, age)
-        request = await asyncio.wait_for(planned.get(), 5)
+        request = await planned.get()
         assert request.stage == "pre-grasp" and isinstance(request.goal, m.SequenceGoal)
         for item, height in zip(request.goal.items, (0.13, 0.03), strict=True):
             position = item.goal.pose.position  # type: ignore[union-attr]
@@ -110,7 +111,7 @@ async def test_empty_plan_and_out_of_range_held_object_do_not_end_the_task() -> 
     cell = FakeCell()
     planned = cell.serve_planner(trajectory(PANDA.robot.joints))
     await cell.bus.ready()
-    async with cell.running(smart_pick_place, PICK_PLACE), asyncio.timeout(10):
+    async with cell.running(smart_pick_place, PICK_PLACE), asyncio.timeout(PATIENCE):
         show_ball(cell)
         await planned.get()
         await planned.get()  # it is planned again

@@ -22,7 +22,7 @@ from tests.services.executor_rig import NOT_TOO_LATE, ExecutorClient, move
 from tests.services.fake_cell import latest
 
 BOX = "{id: box, shape: box, size: [0.06, 0.06], height: 0.7314, x: 0.178, y: 0.109, color: [0.9, 0.1, 0.1]}"
-CUP = ["robot=ur5_cup", "robot.gripper.vacuum={output: vacuum, input: vacuum_ok, timeout: 2.0}", "services.io={}",
+CUP = ["robot=ur5_cup", "robot.gripper.vacuum={output: vacuum, input: vacuum_ok, timeout: 60.0}", "services.io={}",
        "io.signals={vacuum: {output: 0}, vacuum_ok: {input: 0}}", "world.layout=fixed", "world.count=0",
        f"world.objects=[{BOX}]", NOT_TOO_LATE]
 
@@ -93,7 +93,7 @@ async def test_commands_switch_the_output_and_the_output_alone_also_grips() -> N
      "vacuum_ok did not come within 2 s"),
 ])
 async def test_vacuum_that_never_comes_is_one_reason(settings: list[str], reason: str) -> None:
-    async with cup(*settings) as (client, _):
+    async with cup("robot.gripper.vacuum.timeout=2.0", *settings) as (client, _):
         state = await client.close_cup()
         assert (state.state, state.outcome, state.message) == ("aborted", "empty", reason)
 
