@@ -123,6 +123,7 @@ async def new_bus(request: pytest.FixtureRequest) -> AsyncIterator[NewBus]:
             endpoint = request.getfixturevalue("shared_router")
 
             async def make(service: str = "tester") -> Bus:
-                return await stack.enter_async_context(connect(cell=cell, service=service, endpoint=endpoint))
+                return await stack.enter_async_context(
+                    connect(cell=cell, service=service, endpoint=endpoint, timeout=TIMEOUT))
 
         yield make

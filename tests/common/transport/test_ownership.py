@@ -16,7 +16,7 @@ from common.transport.codec import decode
 from common.transport.local import LocalNetwork
 from common.transport.ownership import Owner, Ownership, process_name, unique_owners
 from common.transport.session import Declaration, owns_key
-from tests.common.transport.conftest import TIMEOUT, NewBus, next_of
+from tests.common.transport.conftest import TIMEOUT, NewBus, next_of, until
 
 KEY = topics.CAMERA_IMAGE.key
 
@@ -70,7 +70,7 @@ async def test_deferred_messages_are_published_once_the_key_is_acquired(new_bus,
     assert (await next_of(received)).header.stamp == 10
     with pytest.raises(ConfigError):
         await second.ready()
-    replies = await listener.raw_get(first.full_key(topics.PLANNING_SCENE), 1.0)
+    replies = await listener.raw_get(first.full_key(topics.PLANNING_SCENE), TIMEOUT)
     assert [decode(PlanningScene, sample.payload).header.stamp for sample in replies] == [10]
     assert received.latest is not None and received.latest.header.stamp == 10
     monkeypatch.setattr(ownership, "CLAIM_SECONDS", 10.0)  # tokens of a closed bus vanish late
@@ -230,8 +230,7 @@ async def test_first_service_reports_a_second_one_that_has_ended_already_but_no_
     await split.start(1)
     for token in split.join():
         token.undeclare()
-    await asyncio.sleep(0.01)
-    assert caplog.text.count("gives way: this one was there first") == 1
+    await until(lambda: caplog.text.count("gives way: this one was there first") == 1)
 
 
 async def test_second_service_is_refused_and_reported_by_the_first(split, monkeypatch, caplog) -> None:

@@ -71,11 +71,11 @@ async def test_call_right_after_creating_the_client_finds_the_server(new_bus) ->
 
 async def test_all_servers_are_found_while_the_session_watches_one_of_them(shared_router) -> None:
     cell, names = f"test_{uuid.uuid4().hex[:8]}", [f"server_{number}" for number in range(8)]
-    async with connect(cell=cell, service="host", endpoint=shared_router) as host:
+    async with connect(cell=cell, service="host", endpoint=shared_router, timeout=TIMEOUT) as host:
         for name in names:
             host._declare_token(serves_key(cell, f"param/{name}", name))
         for _ in range(20):  # Zenoh's own query misses one of them in every tenth round
-            async with connect(cell=cell, service="client", endpoint=shared_router) as client:
+            async with connect(cell=cell, service="client", endpoint=shared_router, timeout=TIMEOUT) as client:
                 await client.raw_tokens(serves_key(cell, "param/*"), TIMEOUT)
                 await client._watch(serves_key(cell, f"param/{names[3]}")).known(TIMEOUT)
                 for _ in range(4):
@@ -197,7 +197,9 @@ async def test_one_of_two_servers_acts(new_bus) -> None:
         await server.ready()  # a second server would be refused; these two did not see each other
         server.serve(topics.TASK_COMMAND, act)
         await client.alive.wait(server.service, TIMEOUT)
-    await client.client(topics.TASK_COMMAND).call(START)
+    task = client.client(topics.TASK_COMMAND)
+    await task.wait_available(TIMEOUT)  # its tokens come later than those of the ready services
+    await task.call(START)
     assert len(acted) == 1
 
 
