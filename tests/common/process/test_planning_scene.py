@@ -19,6 +19,7 @@ from common.transport.local import LocalNetwork
 
 SEEN = CollisionObject(id="ball", role="target", shape="sphere", dimensions=[0.03], pose=Pose())
 POLE = SceneEdit(op="add", id="pole", shape="cylinder", dimensions=[0.02, 1.0], pose=Pose(), owner="anna")
+TIMEOUT = 30.0  # [s] only a failing test waits that long
 
 
 async def writer(bus: Bus, config: None) -> None:
@@ -44,12 +45,12 @@ async def test_added_solid_is_published_with_the_perceived_scene_also_after_a_re
     scenes, edits = bus.reader(topics.PLANNING_SCENE), bus.client(topics.SCENE_EDIT)
     async with running_service(net, writer, None, name="writer"):
         assert await next_ids(scenes) == ["ball"]
-        assert (await edits.call(POLE, 5.0)).ids == ["added/pole"]
+        assert (await edits.call(POLE, TIMEOUT)).ids == ["added/pole"]
         assert await next_ids(scenes) == ["ball", "added/pole"]
     with caplog.at_level(logging.WARNING, "writer"):
         async with running_service(net, writer, None, name="writer"):
             assert await next_ids(scenes) == ["ball", "added/pole"]
-            assert (await edits.call(SceneEdit(op="remove", id="pole"), 5.0)).ids == []
+            assert (await edits.call(SceneEdit(op="remove", id="pole"), TIMEOUT)).ids == []
             assert await next_ids(scenes) == ["ball"]
     assert "solids from an earlier session: added/pole" in caplog.text
 
@@ -63,7 +64,7 @@ async def test_solid_is_not_added_if_it_cannot_be_saved(monkeypatch: pytest.Monk
     bus = net.bus("tester", cell="test")
     async with running_service(net, writer, None, name="writer"):
         with pytest.raises(RemoteError, match=r"No space left on device.*was not made") as refused:
-            await bus.client(topics.SCENE_EDIT).call(POLE, 5.0)
+            await bus.client(topics.SCENE_EDIT).call(POLE, TIMEOUT)
         assert refused.value.code == "not_kept"
         assert await next_ids(bus.reader(topics.PLANNING_SCENE)) == ["ball"]
 
