@@ -2,6 +2,7 @@
 
 import threading
 from itertools import pairwise
+from time import thread_time
 
 import coal
 import numpy as np
@@ -118,8 +119,9 @@ def test_tiny_steps_of_a_search_respect_limits():
     kernel, ends = far_from_everything(), (at(-0.9), np.array([[0.9]]))
     found = find_path(kernel, *ends, reach=1e-5, nodes=1000)
     assert found.error == "no_path" and found.nodes <= 1000
+    began = thread_time()  # not what a busy machine adds
     found = find_path(kernel, *ends, reach=1e-8, nodes=10**9, seconds=0.05)
-    assert found.error == "timeout" and found.search_seconds < 1
+    assert found.error == "timeout" and thread_time() - began < 1
 
 
 def test_wrong_arguments_are_refused():
