@@ -2,9 +2,11 @@
 
 import multiprocessing
 import time
+from types import SimpleNamespace
 
 import pytest
 
+from common.hardware import driven_arm
 from common.hardware.driven_arm import TIMEOUT, DrivenArm, Player, Reading
 from common.hardware.driver_process import DriverProcess
 from common.hardware.interface import ArmState, HardwareFault, Limits, Vector
@@ -59,7 +61,9 @@ def test_arm_is_disconnected_without_messages_or_with_too_old_a_state(
     monkeypatch.setattr(DriverProcess, "keep_running", lambda _process: None)  # the test sends the messages
     arm = DrivenArm("none", {}, limits, gripper=None, ahead=0.1, delay=0.0, name="arm")
     state = ArmState([0.1] * 2, [0.0] * 2, "running", age=age)
-    arm._process.on_message(Reading(time.monotonic() - ago, state, 0, "", 0.0))
+    now = time.monotonic()
+    monkeypatch.setattr(driven_arm, "time", SimpleNamespace(monotonic=lambda: now))
+    arm._process.on_message(Reading(now - ago, state, 0, "", 0.0))
     assert arm.state.mode == ("running" if known else "disconnected")
     if known:
         assert list(arm.read(0.0)[0]) == state.q
