@@ -14,6 +14,7 @@ from pathlib import Path
 from common.transport.endpoint import BASE_PORT
 
 DOMAINS = range(60, 233)
+PORTS = range(20_000, 30_000)  # below those that the system takes for outgoing connections
 _given: deque[int] = deque(maxlen=len(DOMAINS))  # returned, the latest last
 _locks: dict[int, int] = {}  # lock descriptors by domain
 
@@ -43,13 +44,21 @@ def free_domain() -> int:
 
 
 def free_port() -> int:
-    """Return a port of 127.0.0.1 that is free now."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
+    """Return a free port of 127.0.0.1, locked against other test processes until this one ends.
+
+    Raises:
+        RuntimeError: none is free.
+    """
+    for port in random.sample(PORTS, len(PORTS)):
+        with suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            if port not in _locks:
+                _take(port)
+                return port
+    raise RuntimeError(f"no port from {PORTS[0]} to {PORTS[-1]} is free")
 
 
 def _take(domain: int) -> None:
-    """Lock a domain until this process ends; raise OSError if another process holds it."""
+    """Lock a domain or port until this process ends; raise OSError if another process holds it."""
     if domain in _locks:
         return
     folder = Path(tempfile.gettempdir(), f"zencell-test-domains-{os.getuid()}")

@@ -9,7 +9,6 @@ import asyncio
 import os
 import re
 import shutil
-import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from urllib.parse import urlsplit
 import pytest
 import pytest_asyncio
 
+from tests.domains import free_port
 from tests.harness import RunningCell
 
 if TYPE_CHECKING:
@@ -78,9 +78,8 @@ class Viewed(RunningCell):
     """A `zencell run` or `up` with a page; `address` is known after `served`."""
 
     def __init__(self, folder: Path, *arguments: str) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as probe:
-            port: int = probe.getsockname()[1]
-        super().__init__(folder, *arguments, "--viewer-port", str(port))
+        self.port = free_port()
+        super().__init__(folder, *arguments, "--viewer-port", str(self.port))
         self.address = ""
 
     async def served(self) -> Viewed:
@@ -156,5 +155,6 @@ async def page(cell: Viewed, opened: Opened) -> AsyncIterator[Page]:
     async with opened() as watched:
         page = await watched.open(cell.address)
         await page.get_by_role("button", name="Start").wait_for()
+        await page.locator("#zc-state:not(:empty)").wait_for()  # over the control socket
         yield page
         assert not watched.errors
