@@ -14,6 +14,7 @@ from common.messages import JointState, WorldObjects
 from common.transport.bus import Reader
 from page.world_editing import center_of, free_positions
 from tests.harness import until
+from tests.page import fake_browser
 from tests.page.browser.conftest import IN_BROWSER, PATIENCE, Opened, Viewed
 from tests.page.browser.test_sizes import check_stop, tab
 
@@ -73,8 +74,9 @@ async def test_task_is_started_paused_resumed_and_stopped(cell: Viewed, page: Pa
         await page.locator('[data-part="task"][data-paused="False"][data-held="False"]').wait_for(state="attached")
         await page.get_by_role("button", name="STOP").click()
         stopped = await until(status, lambda status: not status.started, PATIENCE)
-        ended = await until(motion, lambda status: status.state != "active", PATIENCE)
-        assert ended.state == "cancelled" and stopped.state != "ERROR"
+        ended = await until(motion, lambda status: status.stopped and status.state != "active", PATIENCE)
+        # Unless the stop came between two motions.
+        assert ended.state in ("cancelled", "succeeded") and stopped.state != "ERROR"
         await assert_standstill(joints)
         await page.get_by_text("Check the cell, then press Start.").wait_for()
 
@@ -89,7 +91,8 @@ async def test_arm_is_jogged_only_while_the_button_is_held(cell: Viewed, page: P
             (page, lambda: page.keyboard.press("Escape")), (other, other.close),
         ):
             await tab(shown, "Move")
-            await shown.get_by_role("button", name="jog joint1, plus").hover()
+            plus = shown.get_by_role("button", name="jog joint1, plus")
+            await plus.and_(shown.locator(":not([aria-disabled])")).hover()
             await shown.mouse.down()
             await until(owner, lambda status: status.jogging and status.owner == "page", PATIENCE)
             await end()
@@ -99,7 +102,7 @@ async def test_arm_is_jogged_only_while_the_button_is_held(cell: Viewed, page: P
 
 async def test_stuck_server_is_shown_in_a_banner_and_by_stop_until_it_recovers(cell: Viewed, page: Page) -> None:
     banner, viewer = page.get_by_role("alert"), cell.processes()["viewer"]
-    assert not await banner.is_visible()
+    await banner.wait_for(state="hidden")  # a delay of more than a second shows it, too
     viewer.send_signal(signal.SIGSTOP)
     try:
         await banner.get_by_text("No connection to the page's server").wait_for()
@@ -110,7 +113,7 @@ async def test_stuck_server_is_shown_in_a_banner_and_by_stop_until_it_recovers(c
     finally:
         viewer.send_signal(signal.SIGCONT)
     await banner.wait_for(state="hidden")
-    assert await page.evaluate("document.body.dataset.stale") == ""
+    await page.wait_for_function("document.body.dataset.stale === ''")
 
 
 def positions(truth: WorldObjects) -> dict[str, tuple[float, float]]:
@@ -132,6 +135,9 @@ async def test_object_is_moved_on_the_page_and_the_move_is_undone(cell: Viewed, 
         for field, value in zip(fields, there, strict=True):
             await field.fill(f"{1e3 * value:.0f}")
             await field.press("Enter")
+        async with fake_browser.opened(cell.port) as other:  # the entered numbers and a press use two connections
+            entered = [round(1e3 * value) for value in there]
+            await other.until(lambda: other.values[other.label("Position [mm]")] == entered)
         await page.get_by_role("button", name="Move object", exact=True).click()
         moved = await until(world, lambda truth: positions(truth) != positions(before), PATIENCE)
         (name,) = [name for name, at in positions(before).items() if positions(moved)[name] != at]

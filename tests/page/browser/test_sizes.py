@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 import pytest
 
 from page.layout import TABS
-from tests.page.browser.conftest import IN_BROWSER
+from tests.page.browser.conftest import IN_BROWSER, PATIENCE
 
 if TYPE_CHECKING:
     from playwright.async_api import Page
@@ -76,8 +77,11 @@ TOUCH = """async pixels => {
 
 async def check_stop(page: Page) -> None:
     """Check that STOP is completely visible, large and red, and that nothing overflows."""
-    seen = await page.evaluate(STOP)
-    assert seen["inside"] and seen["apart"] and not seen["sideways"] and not seen["wide"], seen
+    end, fits = time.monotonic() + PATIENCE, False
+    while not fits:  # the bar may grow between two frames: its texts come at any time
+        seen = await page.evaluate(STOP)
+        fits = seen["inside"] and seen["apart"] and not seen["sideways"] and not seen["wide"]
+        assert fits or time.monotonic() < end, seen
     assert seen["width"] >= 100 and seen["height"] >= 44, seen
     red, green, blue = (int(part) for part in seen["red"].strip("rgb()").split(","))
     assert red > 180 and green < 80 and blue < 80
