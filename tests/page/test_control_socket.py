@@ -2,12 +2,12 @@
 
 import asyncio
 import json
-import time
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
 
+from common.time_source import use_time_source
 from page.access import CURRENT_SESSION, PageSession, Permissions
 from page.console import ActionQueue
 from page.control_socket import (
@@ -20,6 +20,7 @@ from page.control_socket import (
     LossDetector,
     PressDelay,
 )
+from tests.page.test_permissions import Clock
 
 SESSION = PageSession(1, "127.0.0.1", frozenset({"look", "operate"}))
 AVAILABLE = {"arm": ("no arm", True), "task": ("no task", True)}
@@ -30,7 +31,8 @@ class Page(HoldHandler):
     """A page with its WebSocket: `incoming` are its messages, `results` the replies, `presses` the effective ones."""
 
     def __init__(self) -> None:
-        self.permissions = Permissions()
+        self.permissions, self.clock = Permissions(), Clock()
+        self.clock.now = 100.0
         self.incoming: asyncio.Queue[str] = asyncio.Queue()
         self.results: asyncio.Queue[str] = asyncio.Queue()
         self.presses: asyncio.Queue[int] = asyncio.Queue()
@@ -63,8 +65,9 @@ async def page() -> AsyncIterator[Page]:
     page.permissions.enforced = True
     running = [asyncio.create_task(actions.run()), asyncio.create_task(control.serve(page))]
     page.receive(do="page", what=page.permissions.issue_key(SESSION))
-    async with asyncio.timeout(10):
-        yield page
+    with use_time_source(page.clock):  # a delay of this machine makes no status too old
+        async with asyncio.timeout(10):
+            yield page
     for task in running:
         task.cancel()
     await asyncio.gather(*running, return_exceptions=True)
@@ -72,7 +75,7 @@ async def page() -> AsyncIterator[Page]:
 
 
 async def test_press_whose_messages_are_all_late_has_no_effect(page: Page) -> None:
-    now = time.monotonic()
+    now = page.clock.now
     for press, seen in ((1, now - MAX_STATUS_AGE - 1), (2, 0.0), (3, now)):
         for number in range(3):
             page.hold_down(press, seen, at=number * 40.0)
@@ -80,10 +83,10 @@ async def test_press_whose_messages_are_all_late_has_no_effect(page: Page) -> No
 
 
 async def test_closed_page_cannot_act_over_its_open_control_socket(page: Page) -> None:
-    page.hold_down(1, time.monotonic())
+    page.hold_down(1, page.clock.now)
     await page.presses.get()
     page.permissions.remove(SESSION)
-    page.hold_down(2, time.monotonic())
+    page.hold_down(2, page.clock.now)
     assert "nothing was done" in await page.results.get()
     assert page.presses.empty()
 
