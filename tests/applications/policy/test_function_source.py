@@ -132,7 +132,7 @@ class Policy:
 an_object = Policy()
 
 
-def made(name, timeout=5.0, **actions):
+def made(name, timeout=30.0, **actions):
     return source(SourceConfig(callable=f"{HERE}:{name}", timeout=timeout, actions=actions), panda_cell("top"))
 
 
