@@ -21,7 +21,7 @@ class Ros:
     """A session on the side of ROS."""
 
     def __init__(self, endpoint: str, domain: int) -> None:
-        self.session = zenoh.open(client_config(endpoint, connect_ms=5000))
+        self.session = zenoh.open(client_config(endpoint, connect_ms=round(1e3 * TIMEOUT)))
         self.domain = domain
         self._publishers: dict[str, zenoh.Publisher] = {}
 

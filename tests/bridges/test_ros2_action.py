@@ -17,8 +17,9 @@ from common.config import Members, Run
 from common.transport.bus import Bus
 from common.transport.foreign import open_foreign
 from services import trajectory_executor
-from tests.harness import RunningCell
+from tests.harness import RunningCell, until
 from tests.services.executor_rig import HOME, PANDA, SPEED, ExecutorClient, config
+from tests.services.fake_cell import latest
 
 pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")
 pytest.importorskip("xxhash", reason="the extra `ros2` is not installed")
@@ -146,6 +147,10 @@ class Cell(ExecutorClient):
         self.put(topics.PLANNING_SCENE, m.PlanningScene(header=self.bus.header(), objects=list(objects)))
         await asyncio.sleep(0.05)
 
+    async def held(self, reason: str) -> None:
+        """Return when the executor has reported a hold."""
+        await latest(self.motion, lambda status: any(each.reason == reason for each in status.interlocks))
+
     async def moving(self) -> None:
         async with asyncio.timeout(TIMEOUT):
             while await self.turned() < 0.02:
@@ -267,11 +272,11 @@ async def test_stop_by_ros_voids_the_goals_before_it(cell: Cell, monkeypatch: py
         assert not (await pending)[1]  # cancelled before it started
     assert not accepted and "too close" in (await cell.result(goal))[2]
     await cell.hold.call(m.HoldRequest(hold=True, owner="ros2", reason="paused"))
-    await cell.scene()  # the bridge knows the hold by now
+    await cell.held("paused")
     later, accepted = await cell.send(GOAL(NAMES, (8.0, HOME)))
     assert accepted and (await cell.result(later))[0] == SUCCEEDED  # of the same operator
     await cell.hold.call(m.HoldRequest(hold=True, owner="anna", reason="look"))
-    await cell.scene()
+    await cell.held("look")
     held, accepted = await cell.send(GOAL(NAMES, (8.0, HOME)))
     assert not accepted and "by anna (look)" in (await cell.result(held))[2]
 
@@ -324,8 +329,9 @@ async def test_cell_of_processes_obeys_a_client_of_ros(tmp_path: Path) -> None:
         "services: {trajectory_executor: {}, scene_manager: {}}\n")
     with RunningCell(tmp_path, "up", "arm.yaml", "--ros2", "5") as running:
         assert running.domain != 42
-        async with running.listen():
-            pass
+        async with running.listen() as bus:
+            for topic in (topics.PLANNING_SCENE, topics.JOINT_STATES):  # without which a goal is rejected
+                await until(bus.reader(topic), lambda _: True)
         ros = Ros(running.endpoint, 5)
         client = FollowClient(ros, "/arm/follow_joint_trajectory")
         await ros.tokens("SS/%/%arm/zencell/%arm%follow_joint_trajectory%_action%get_result/")
