@@ -204,6 +204,8 @@ def test_custom_service_joins_a_cell(folder: Path) -> None:
         with start(join, folder, env) as service:
             while "panda/nearest_target" not in run_command("zencell node list", folder, **env).stdout:
                 assert service.poll() is None, service.communicate()
+            while run_command(echo, folder, **env).returncode:  # until its first message
+                assert service.poll() is None, service.communicate()
             commands = [start(line, folder, env) for line in (
                 echo, "zencell topic hz nearest_target -n 1", "zencell topic echo neerest_target")]
             shown, rate, slip = (command.communicate(timeout=TIMEOUT) for command in commands)

@@ -88,7 +88,7 @@ async def test_operator_sees_the_image_of_the_requested_contours(cell, tmp_path)
         await cell.put(topics.CONTOURS, stamp, pixels)
         await cell.put(topics.CONTOUR_IMAGE, stamp, np.full((12, 16, 3), 50 * stamp, np.uint8))
     cell.answers.put_nowait("0")
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         await asking
     shown = cv2.imread(str(tmp_path / "test_contours.png"))
     middles = {100: (5 / 3, 4 / 3), 150: (23 / 3, 22 / 3)}
@@ -115,7 +115,7 @@ async def test_selection_with_lost_answer_is_repeated_and_an_unanswered_one_repo
     await cell.put(topics.CONTOUR_IMAGE, 1, np.zeros((12, 16, 3), np.uint8))
     for _ in range(2):
         cell.answers.put_nowait("0")
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(60):
         await asking
     assert len(cell.chosen) == visits.TRIES + 2
     output = capsys.readouterr().out
