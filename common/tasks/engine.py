@@ -125,6 +125,8 @@ class Task(ExecutionMonitor[V]):
                 status.message = FOUND_HELD + "".join(f"; {one.description}" for one in view.motion.interlocks)
             if view.motion.stopped:  # an operator stopped it: a restart must not undo that
                 status.started = status.paused = False
+            if view.holding or view.motion.state == "active":  # an earlier process of the task moved something
+                self.images_after = view.now
         self._report_stopped(view.motion.stopped)
         if self._began is None and status.started:
             self._began = view.now

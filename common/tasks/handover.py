@@ -225,8 +225,11 @@ class Receiving(Handover):
             self.end("ERROR", f"{thing.kind or thing.id} in the gripper of {partner.name}: {self._problem}")
             return
         z, T_world_object = -partner.T_world_tcp[:3, 2], pose_to_matrix(thing.pose)
-        along, width = partner.T_world_tcp[:3, 0], thing.dimensions[0] * 2
-        if thing.shape == "box":
+        along = partner.T_world_tcp[:3, 0]
+        width: float | None = thing.dimensions[0] * 2
+        if thing.shape == "box" and not thing.kind:  # not detected: only its width between the other fingers is known
+            width = None
+        elif thing.shape == "box":
             width = thing.dimensions[int(np.abs(T_world_object[:3, :3].T @ along).argmax())]
         ends = []
         for y in (along, -along):  # the fingers close across those of the other arm

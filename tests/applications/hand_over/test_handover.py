@@ -197,14 +197,15 @@ def test_receiver_that_comes_back_late_looks_where_its_box_is_free_before_it_tak
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", [pytest.param("close", marks=pytest.mark.campaign), "across"])
-def test_part_gets_into_the_box_although_a_restart_forgot_what_the_receiver_holds(stage: str) -> None:
+@pytest.mark.parametrize(("arm", "stage"), [
+    pytest.param("right", "close", marks=pytest.mark.campaign), ("right", "across"), ("left", "offer")])
+def test_part_gets_into_the_box_although_a_restart_forgot_what_an_arm_holds(arm: str, stage: str) -> None:
     async def visit(bus: Bus) -> None:
         watch = Watch(bus)
-        await watch.until("right", stage)
-        while "right" not in watch.holding():
-            await watch.grippers["right"].next()
-        simulation.kill("right_scene_manager")
+        await watch.until(arm, stage)
+        while arm not in watch.holding():
+            await watch.grippers[arm].next()
+        simulation.kill(f"{arm}_scene_manager")
 
     simulation = Simulation(cell(), 1, visit=visit)
     outcome = simulation.run()

@@ -40,6 +40,15 @@ def test_decision_after_awaiting_an_image_uses_a_later_one(cell: Cell) -> None:
     assert cell.task.images_after == view.now
 
 
+@pytest.mark.parametrize(("found", "waits"), [("an object", True), ("a motion", True), ("nothing", False)])
+def test_task_that_finds_its_work_begun_waits_for_a_later_image(cell: Cell, found: str, waits: bool) -> None:
+    cell.gripper = m.GripperState(width=0.04, holding=found == "an object")
+    cell.motion = m.MotionStatus(state="active" if found == "a motion" else "none")
+    view = cell.view()
+    cell.task.step(view)
+    assert (cell.task.images_after == view.now) is waits
+
+
 def test_start_after_the_end_restarts_the_time(cell: Cell) -> None:
     cell.status.state = "DONE"
     cell.now += 1000
