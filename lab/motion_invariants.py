@@ -286,7 +286,7 @@ class MotionInvariants:
         """Check that a requested hold took effect, unless it is for a goal that is over."""
         if not (isinstance(request, HoldRequest) and request.hold and isinstance(answer, MotionStatus)):
             return
-        if getattr(request, "goal", "") not in ("", answer.id):
+        if request.goal and (answer.id != request.goal or answer.state != "active"):
             return
         if self._checks.fails(answer.held, HELD):
             self._checks.add_violation(HELD, f"it is not held when {service} requests it")

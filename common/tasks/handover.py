@@ -129,6 +129,10 @@ class Handover(Handling):
             self._line("withdraw", "HOMING", None, [backward(tool, self.p.back_off)], partner, held),
             self.home(view), AwaitImage()]
 
+    def fail(self, message: str, view: View, *, go_home: bool = True) -> None:
+        """Count a failure; between the grippers, only `back_off` leads home."""
+        super().fail(message, view, go_home=go_home and self.meets(view) is None)
+
     def _line(self, name: str, state: str, cycle: Cycle | None, ends: list[Array], partner: Partner,
               held: m.CollisionObject | None) -> Move:
         """Return a slow straight line on which the gripper may touch what the other arm holds."""

@@ -78,12 +78,13 @@ def test_goal_stopped_before_it_arrived_never_moves(invariants, requests, known)
     assert invariants.broken == ([] if known else [f"1.000 s: {NEVER}: a-1"])
 
 
-@pytest.mark.parametrize(("goal", "held", "holds"), [
-    ("", True, True), ("", False, False), ("a-1", False, False), ("a-0", False, True),
+@pytest.mark.parametrize(("goal", "state", "held", "holds"), [
+    ("", "active", True, True), ("", "active", False, False), ("a-1", "active", False, False),
+    ("a-0", "active", False, True), ("a-1", "succeeded", False, True),
 ])
-def test_requested_hold_takes_effect_unless_its_goal_is_over(invariants, requests, goal, held, holds):
+def test_requested_hold_takes_effect_unless_its_goal_is_over(invariants, requests, goal, state, held, holds):
     request = m.HoldRequest(hold=True, reason="a mug blocks the path", by="scene_monitor", goal=goal)
-    requests.on_answer("motion_planner", request, m.MotionStatus(id="a-1", state="active", held=held))
+    requests.on_answer("motion_planner", request, m.MotionStatus(id="a-1", state=state, held=held))
     assert (invariants.broken == []) == holds
 
 

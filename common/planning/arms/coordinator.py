@@ -371,8 +371,11 @@ class Coordinator:
         if state is None or state.grips or now - max(arm.rest_since, since) < self.options.patience or (
                 arm.ticket is not None and arm.ticket.goal.startswith(RETREAT)):
             return []
-        if arm.is_home or arm.back is None:
-            return "is at home" if arm.is_home else "has no proved way back"
+        if arm.is_home:
+            return "is at home"
+        carried = [name for other in self._others(arm) for name in other.body.carried]
+        if arm.back is None or (arm.back.touch is not None and arm.back.touch.object not in carried):
+            return "has no proved way back"
         for other in self._others(arm):
             clash = None if other.committed is not None else self.proofs.anywhere(arm.rest, other.rest)
             if clash is not None and clash.certain:  # in a handover

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from common import messages as m
 from common import topics
 from common.arms import arms_topic
 from common.config import Cell, load_cell, service_config
+from common.planning.arms.coordinator import Coordinator, Decision
 from common.robot.model import RobotModel
 from common.tasks.handover import Receiving, backward
 from common.tasks.stages import Move
@@ -171,6 +173,24 @@ def test_stop_while_a_part_changes_hands_drops_nothing_and_only_a_start_continue
 def test_each_arm_has_a_complete_task(arm: str, task: type[Giver | Receiver]) -> None:
     config = service_config(cell(), f"{arm}_hander", Config)
     assert task(config, m.TaskStatus(), arm).status.state == "IDLE"
+
+
+@pytest.mark.slow
+def test_giver_whose_way_out_was_refused_withdraws_in_a_straight_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    refused: list[str] = []
+    request = Coordinator.request
+
+    def refuse_once(self: Coordinator, arm: str, goal: str, *rest: Any, **more: Any) -> Decision:
+        if arm == "left" and self.arms["right"].body.carried and not refused:
+            refused.append(goal)
+        if goal in refused:
+            return Decision("refused", "blocked", "refused by the test")
+        return request(self, arm, goal, *rest, **more)
+
+    monkeypatch.setattr(Coordinator, "request", refuse_once)
+    outcome = Simulation(cell(), 1).run()
+    assert (outcome.state, outcome.done, outcome.total, outcome.crashes) == ("DONE", 1, 1, []), outcome
+    assert refused
 
 
 @pytest.mark.slow

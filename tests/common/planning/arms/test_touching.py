@@ -107,3 +107,5 @@ def test_who_reached_in_moves_back_first_and_neither_does_while_both_hold() -> N
     for arm, other in ((left, right), (right, left)):
         assert coordinator.move_back(arm, other, 0.0, 20.0) == (
             f"holds what {other.name} holds, too: open one of the grippers")
+    coordinator.carry("left", left.geometry.body([]))  # the giver has opened, and is the one to withdraw
+    assert coordinator.move_back(right, left, 0.0, 30.0) == "has no proved way back"
