@@ -123,10 +123,8 @@ def run(**given: Any) -> None:
     before = verbs.before_run(given["cell"], given["overrides"], given["world"], of_applications)
     session = _session(**before.changed(given), until_ended=True)
     require_task(session.on_all_hosts)
-    if before.check is not None:
-        before.check()
     session.first = before.first
-    raise typer.Exit(before.ending(session.run_to_end))
+    raise typer.Exit(before.checked(session.run_to_end))
 
 
 def up(**given: Any) -> None:

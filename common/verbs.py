@@ -75,6 +75,12 @@ class BeforeRun:
         """Return the options of the run with its cell and overrides."""
         return {**given, "cell": self.cell or given["cell"], "overrides": self.overrides}
 
+    def checked(self, work: Callable[[], T]) -> T:
+        """Return the result of a run to the end of the task, as `ending` does, after `check`."""
+        if self.check is not None:
+            self.check()
+        return self.ending(work)
+
     def ending(self, work: Callable[[], T]) -> T:
         """Return the result of the run, and call `after` at its end."""
         try:
