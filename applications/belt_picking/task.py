@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from statistics import median_low
 from typing import Literal
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from common import messages as m
 from common.config import Tunable
@@ -66,11 +66,19 @@ class BeltView(View):
     belts: m.ConveyorState | None = None
 
 
+class Counts(BaseModel):
+    """What an image of the container does not tell a restarted task: objects that lie on others are not counted."""
+
+    done: int = 0
+    attempts: int = 0
+
+
 class BeltPicking(Handling):
     """Picks in motion."""
 
     p: Config
     ONE_DESTINATION = True
+    _counts = Counts()
 
     def __init__(self, config: Config, status: m.TaskStatus, prefix: str, speed: float = 1.0) -> None:
         """Start without an object; the arguments are those of `Task`."""
@@ -83,6 +91,20 @@ class BeltPicking(Handling):
         self._latencies: deque[float] = deque(maxlen=LATENCIES)  # from a decision to the accepted motion [s]
         self._decided = 0.0  # cell time of the last decision [s]
         self._took = 0.0  # planned duration of the last motion with an object [s]
+
+    @property
+    def memory(self) -> Counts:
+        """Counters, for a restart."""
+        now = Counts(done=self.status.done, attempts=self._attempts)
+        if now != self._counts:
+            self._counts = now
+        return self._counts
+
+    def remember(self, memory: BaseModel) -> None:
+        """Continue to count."""
+        assert isinstance(memory, Counts)
+        self._counts, self._attempts = memory, memory.attempts
+        self.status.done = self.status.total = memory.done
 
     # --- decisions -----------------------------------------------------------------------------------------------
 
