@@ -39,7 +39,8 @@ class Config(HandlingConfig):
     deviation: Tunable[float] = Field(
         0.006, gt=0, le=0.05, description="the motion ends before the fingers close if the belt puts the object so far "
                                           "from where it was expected [m]")
-    settle: Tunable[float] = Field(6.0, ge=0, le=600, description="so long nothing comes before it is DONE [s]")
+    settle: Tunable[float] = Field(6.0, ge=0, le=600, description="so long nothing comes before it is DONE; on a belt "
+                                                       "with `end: wrap` at least for one turn [s]")
 
     def require_usable(self) -> None:
         """Check belt, window and container.
@@ -134,13 +135,20 @@ class BeltPicking(Handling):
         if coming:
             self.wait_timer.reset()
         elif not self._problem_of(view):
-            self.finish(view, attempts=self._attempts)
+            self.finish(view, self._turn_time(view), attempts=self._attempts)
             return
         self.status.message = self._problem_of(view)
         if self.status.message:
             return
         for way, thing in self._in_reach(view)[:1]:
             self._pick(way, thing, view)
+
+    def _turn_time(self, view: BeltView) -> float:
+        """Return the time in which an object out of view comes back on a circulating belt [s]."""
+        belt = view.belts.find(self._name) if view.belts is not None else None
+        if self._belt.end != "wrap" or belt is None or belt.speed == 0.0:
+            return 0.0
+        return self._belt.dimensions[0] / abs(belt.speed)
 
     def _in_reach(self, view: View) -> list[tuple[float, m.CollisionObject]]:
         """Return the objects that can be met now, farthest first, with their distance from the start [m]."""

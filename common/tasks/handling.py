@@ -98,9 +98,9 @@ class Handling(Task[View]):
         self.wait_timer.reset()
         self.queue += self._take(thing, view)
 
-    def finish(self, view: View, **figures: float) -> None:
-        """End with DONE once this holds for the settling time; `figures` go into the status."""
-        if self.wait_timer.elapsed("done", view.scene_stamp) >= self.p.settle:
+    def finish(self, view: View, least: float = 0.0, **figures: float) -> None:
+        """End with DONE once this holds for the settling time, `least` [s]; `figures` go into the status."""
+        if self.wait_timer.elapsed("done", view.scene_stamp) >= max(self.p.settle, least):
             self.status.figures.update(figures)
             self.end("DONE")
 

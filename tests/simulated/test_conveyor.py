@@ -19,17 +19,17 @@ from tests.harness import until
 pytestmark = pytest.mark.slow
 
 
-def cell(y: float, speed: float) -> Cell:
+def cell(y: float, speed: float, end: str = "fall") -> Cell:
     """Return the cell with one cube on the belt, at this y [m] at the start."""
     cube = {"id": "cube", "shape": "box", "size": [0.04, 0.04, 0.04], "x": 0.52, "y": y, "z": 0.06, "yaw": 0.4,
             "color": [0.9, 0.1, 0.1]}
     return load_cell("conveyor", [
         f"world.objects={json.dumps([cube])}", f"world.conveyors.belt.speed={speed}", "services.depth_camera.rate=5",
-        "services.belt_picker.settle=1"])
+        f"world.conveyors.belt.end={end}", "services.belt_picker.settle=1"])
 
 
-@pytest.mark.parametrize(("y", "speed"), [(-0.75, 0.2)])
-def test_cube_is_picked_from_the_moving_belt_and_put_into_the_box(y: float, speed: float) -> None:
+@pytest.mark.parametrize(("y", "speed", "end"), [(-0.75, 0.2, "fall"), (0.6, 0.2, "wrap")])
+def test_cube_is_picked_from_the_moving_belt_and_put_into_the_box(y: float, speed: float, end: str) -> None:
     held: list[float] = []
 
     async def visit(bus: Bus) -> None:
@@ -38,7 +38,7 @@ def test_cube_is_picked_from_the_moving_belt_and_put_into_the_box(y: float, spee
         assert states.latest is not None
         held.extend((states.latest.belts[0].speed, grasped.width))
 
-    outcome = Simulation(cell(y, speed), 1, limit=60.0, visit=visit).run()
+    outcome = Simulation(cell(y, speed, end), 1, limit=60.0, visit=visit).run()
     assert (outcome.state, outcome.done, outcome.crashes, outcome.broken) == ("DONE", 1, [], []), outcome
     assert held == pytest.approx([speed, 0.04], abs=1e-3)
 
