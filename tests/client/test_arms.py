@@ -52,7 +52,7 @@ def test_stop_that_names_no_arm_stops_both_until_a_start_that_knew_it() -> None:
         await cell.call("motion/stop")  # of an unknown operator
         seen = (await cell.arms["left"].status()).newest
         await cell.call("motion/stop", reason="intruder")
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0.1)  # virtual: the task has received it
         answer = await cell.call("task/command", command="start", acknowledged=seen)
         assert answer.message.count("by operator (intruder): start to go on") == 2  # of each arm
         assert await stopped(cell) == [True, True]

@@ -148,7 +148,7 @@ def test_unusable_files_leave_the_previous_ones_in_force(folder: Path, endpoint:
         (folder / "router.key").write_bytes((folder / "operator.key").read_bytes())
         until("nothing was logged", lambda: caplog.records)
     assert "the previous ones stay in force" in caplog.text
-    until("nobody can connect", lambda: can_connect(endpoint, credentials_of("operator", folder)))
+    until("the operator cannot connect", lambda: can_connect(endpoint, credentials_of("operator", folder)))
 
 
 @pytest.mark.slow
