@@ -181,7 +181,7 @@ def _problems(path: Path, lines: Mapping[str, int], errors: Sequence[Mapping[str
             if isinstance(part, int):
                 place += f"[{part}]"
             elif "-" not in part and not part.endswith("]"):  # not a branch of a union, such as constrained-float
-                place = f"{place}.{part}".lstrip(".")
+                place = " ".join(f"{place}.{part}".lstrip(".").split())  # a key may contain line breaks
         by_place.setdefault(place, []).append(error)
     return [_problem(path, lines, place, found[0], ", or ".join(map(expected_text, found)))
             for place, found in by_place.items()]

@@ -79,6 +79,7 @@ class Rehearser:
         self.planned = 0
         self._turned: dict[Position, bool] = {}  # loops by condition that have turned once
         self._visited: set[str] = set()
+        self._guessed = False  # whether a condition was assumed
         self._lost = ""  # step after which the state of the robot is not known
         self._wrong: Mapping[str, str] = {
             step.id: problem for file in flow.files.values() for step, problem in static_problems(file, cell, io)}
@@ -108,7 +109,7 @@ class Rehearser:
         if everything:
             for file in self.flow.files.values():
                 for step in file.steps.values():
-                    if step.id not in self._visited and not type(step).BODIES:
+                    if step.id not in self._visited and (not type(step).BODIES or step.id in self._wrong):
                         (self._q, self.scene, self._now), self._lost = begin, ""
                         yield from self._rehearse(
                             step, file, "is not reached in the dry run: planned from the state at the start")
@@ -132,7 +133,8 @@ class Rehearser:
             certain = yield from self._plan(step, file, item)
         if not certain:
             after = f"begins after {self._lost}, whose end is not known" if self._lost not in ("", step.id) else ""
-            item.unknown = "; ".join(each for each in (item.unknown, assumed, after) if each)
+            guess = "a condition before is assumed" if self._guessed and item.problem else ""
+            item.unknown = "; ".join(each for each in (item.unknown, assumed, after, guess) if each)
         self.result.seconds += item.seconds or 0.0
         self.result.steps.append(item)
 
@@ -151,6 +153,7 @@ class Rehearser:
             return False
         except ZencellError as error:
             item.problem, self._lost = str(error)[:500], self._lost or step.id
+            item.unknown = "depends on the state before the step"
             return False
         seconds, unknown, certain = 0.0, "", False
         for stage in built.stages:
@@ -203,7 +206,7 @@ class Rehearser:
         self.scene = self.scene.model_copy(update={"objects": objects})
 
     def _assume(self, condition: Condition, position: Position) -> bool:
-        step = self.flow.step(position)
+        step, self._guessed = self.flow.step(position), True
         if condition.holding is not None and isinstance(step, If):
             return self._now.holding is condition.holding
         if condition.outcome and isinstance(step, If):

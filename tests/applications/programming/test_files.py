@@ -58,6 +58,8 @@ def test_program_is_written_as_it_was_read_and_every_step_has_an_id() -> None:
     ("steps: [{step: move, id: a, to: home}, {step: move, id: a, to: home}]",
      ":1: steps[1].id: 'a' is also the id of the step in line 1; each needs its own"),
     ("steps: 5", ":1: steps: 5 must be a list"),
+    ('"x\\ny": 3\nsteps: [{step: move, to: home}]',
+     ": x y: 3 is not a field; choices: cell, note, poses, speed, steps"),
     ("speed: fast\nsteps: []", ":1: speed: 'fast' must be a valid number"),
     ("poses: {bin: 3}\nsteps: []", ":1: poses.bin: 3 must be a mapping"),
 ])

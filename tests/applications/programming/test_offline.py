@@ -68,6 +68,9 @@ def test_check_reports_all_problems_at_once_each_with_line_and_step(tmp_path: Pa
 
 UNSURE = """\
 steps:
+  - {step: if, when: {signal: busy}, then: [{step: move, to: {position: [0.6, 0.1, 0.5]}}]}
+  - {step: retreat, distance: 0.25, axis: world}
+  - {step: if, when: {signal: busy}, then: [{step: place, at: home}]}
   - {step: pick, kind: ball}
   - {step: retreat, distance: 1.5}
   - {step: move, to: {position: [1.5, 0, 0.3]}, on_failure: continue}
@@ -75,9 +78,11 @@ steps:
 
 
 @pytest.mark.parametrize(("more", "refused"), [
-    ("  - {step: move, to: {position: [1.5, 0, 0.3]}}", "5: move2: no pose of the goal region can be reached"),
-    ("  - {step: place, at: {position: [0.5, 0, -0.1]}}", "5: place1: all "),
-    ("  - {step: if, when: {holding: false}, then: [{step: output, signal: clam}]}", "5: output1: steps[3].then[0]"),
+    ("  - {step: move, to: {position: [1.5, 0, 0.3]}}", "8: move3: no pose of the goal region can be reached"),
+    ("  - {step: place, at: {position: [0.5, 0, -0.1]}}", "8: place2: all "),
+    ("  - {step: if, when: {holding: false}, then: [{step: output, signal: clam}]}", "8: output1: steps[6].then[0]"),
+    ("  - {step: if, when: {signal: bussy}, then: [{step: wait, seconds: 1}]}", "8: if3: steps[6].when"),
+    ("  - {step: loop, while: {signal: bussy}, steps: [{step: wait, seconds: 1}]}", "8: loop1: steps[6].while"),
     ("", ""),
 ])
 def test_run_refuses_what_fails_wherever_the_program_is_and_nothing_else(
